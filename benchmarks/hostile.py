@@ -37,7 +37,7 @@ from ringfence.report import board  # noqa: E402
 from ringfence.report.table import sections  # noqa: E402
 from ringfence.training import loop, worlds  # noqa: E402
 from ringfence.training.runs import Run  # noqa: E402
-from tests import corpus, strange  # noqa: E402
+from tests import corpus, strange, strange_files  # noqa: E402
 from tests.corpus import TASK  # noqa: E402
 from tests.quick import QUICK_WORLD  # noqa: E402
 
@@ -265,6 +265,10 @@ def of_tables(place: Path, times: int) -> Iterator[Case]:
     yield from strange.files_of_tables(place, random.Random(times), times)
 
 
+def of_importers(place: Path, times: int) -> Iterator[Case]:
+    yield from strange_files.files(place, random.Random(times), times)
+
+
 def of_archives(place: Path, times: int) -> Iterator[Case]:
     from ringfence.bench import unpack
 
@@ -306,6 +310,7 @@ PARTS: dict[str, Callable[[Path, int], Iterator[Case]]] = {
     "recordings": films,
     "arrays that become a store": lambda place, times: strange.arrays_of_stores(),
     "tables": of_tables,
+    "files of importers": of_importers,
     "simulators": of_simulators,
     "run time: observations, costs, actions": of_run_time,
     "words in reports and commands": of_words,

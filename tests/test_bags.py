@@ -609,3 +609,10 @@ def test_a_stamp_that_is_late_is_refused(tmp_path):
     with pytest.raises(StoreError, match=r"'/r1/odom', 0 s after its first, is 9 s off .*\(5 s are allowed\); cut"):
         read_bag(write(tmp_path, pair(**{"/r1/odom": late})), "/r{i}")
     assert len(read_bag(tmp_path / "log", "/r{i}", stamps=False).columns["x"]) == 12
+
+
+@pytest.mark.parametrize("roles", [{"odom": "cmd_vel"}, {"cmd": "odom"}, {"cost": "odom"}, {"joints": "odom"}])
+def test_one_topic_is_of_one_role(tmp_path, roles):
+    path = write(tmp_path, pair())
+    with pytest.raises(UserError, match="of 'r0' name one topic twice"):
+        read_bag(path, "/r{i}", **roles)

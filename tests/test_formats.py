@@ -13,6 +13,7 @@ import pytest
 
 from ringfence.cli import app
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.columns import read_columns
 from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.io.observe import observe
 from ringfence.logs.io.units import utm, zone_of
@@ -163,7 +164,7 @@ def test_sumos_output_is_read_as_it_is(tmp_path, kind):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("<fcd-export><timestep", "is truncated or no XML"),
+        ("<fcd-export><timestep", "damaged or no XML"),
         ("<routes/>", "begins with <routes>"),
         ("<fcd-export/>", "holds no vehicle"),
         ('<fcd-export><vehicle id="a"/></fcd-export>', "outside of any <timestep>"),
@@ -317,7 +318,7 @@ def test_a_file_of_a_data_set_is_a_table_of_named_lists(tmp_path):
     [
         ({"codebase_version": "v1.6"}, (), "version v1.6"),
         ({"fps": 0}, (), "0.0 frames a second"),
-        ({"features": 3}, (), "not what LeRobot writes"),
+        ({"features": 3}, (), "no info.json that LeRobot writes"),
         ({"features": {}}, (), "column of the data set 'observation.state'"),
         ({}, ("left_", "left_"), "names one twice"),
         ({}, ("left_",), "The action 'right_waist' begins with none of left_"),
@@ -338,7 +339,7 @@ def test_folders_that_are_no_data_sets_are_refused(tmp_path):
     with pytest.raises(UserError, match="holds no data/"):
         read_lerobot(tmp_path / "set")
     (tmp_path / "set" / "meta" / "info.json").write_text("[" * 10**5)
-    with pytest.raises(UserError, match="not what LeRobot writes"):
+    with pytest.raises(UserError, match="no info.json that LeRobot writes"):
         read_lerobot(tmp_path / "set")
 
 
@@ -703,3 +704,17 @@ def test_public_sets_are_read_by_one_command_each(tmp_path, capsys):
         "air": (2, 29, 1.0),
         "sea": (2, 29, 60.0),
     }
+
+
+def test_words_of_parquet_that_are_missing_stay_missing(tmp_path):
+    """Arrow's own way to NumPy gives a missing entry of a dictionary the word of the row before."""
+    from pyarrow import array, parquet, table
+
+    who = array(["a", "b", None]).dictionary_encode()
+    lists, numbers = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], [1, None, 3]
+    parquet.write_table(table({"who": who, "l": lists, "n": numbers, "a.b": [1, 2, 3]}), tmp_path / "a.parquet")
+    for source in (tmp_path / "a.parquet", parquet.read_table(tmp_path / "a.parquet")):
+        found = read_columns(source, ["who", "l", "n", "a.b"])
+        assert found["who"].tolist() == ["a", "b", None] and found["l"].tolist() == lists
+        np.testing.assert_array_equal(found["n"], [1, np.nan, 3])
+        np.testing.assert_array_equal(found["a.b"], [1, 2, 3])

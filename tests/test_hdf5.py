@@ -280,7 +280,7 @@ def test_other_files_are_refused(tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="holds no main_data.hdf5"):
         import_hdf5(tmp_path)
     (tmp_path / "text").write_text("no HDF5")
-    with pytest.raises(StoreError, match="truncated or not HDF5"):
+    with pytest.raises(StoreError, match="truncated, damaged or no HDF5"):
         import_hdf5(tmp_path / "text")
     for held, said in (
         ({}, "holds nothing, which fits neither"),
@@ -298,7 +298,7 @@ def test_other_files_are_refused(tmp_path, monkeypatch):
     whole = good.read_bytes()
     for size in (100, len(whole) // 2, len(whole) - 200):
         (tmp_path / "cut.hdf5").write_bytes(whole[:size])
-        with pytest.raises(StoreError, match="is truncated or not HDF5|is damaged"):
+        with pytest.raises(StoreError, match="is truncated, damaged or no HDF5"):
             import_hdf5(tmp_path / "cut.hdf5")
     monkeypatch.setattr(arrays, "_memory", lambda: 100.0)
     with pytest.raises(StoreError, match="GiB of arrays, this machine has"):
@@ -491,7 +491,7 @@ WORSE = {
     "count": (lambda f, d: space(d, {"total_episodes": 7}), "holds 6 episodes, its metadata tells of 7"),
     "choices": (lambda f, d: space(d, {"action_space": '{"type": "Discrete", "n": 3}'}), "Discrete actions, choices"),
     "no space": (lambda f, d: space(d, {"action_space": '{"type": "Box"}'}), "action space that cannot be read"),
-    "no JSON": (lambda f, d: (d / "metadata.json").write_text("{"), "metadata.json' cannot be read"),
+    "no JSON": (lambda f, d: (d / "metadata.json").write_text("{"), "metadata.json' is truncated, damaged"),
 }
 
 

@@ -18,8 +18,10 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+import ringfence
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
+from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.evaluation.evaluate import evaluate
@@ -27,9 +29,10 @@ from ringfence.loading import resolve
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.report import board
+from ringfence.report.pooling import normal_return
 from ringfence.report.table import sections
 from ringfence.training.runs import Run
-from tests import corpus, strange
+from tests import corpus, strange, strange_files
 from tests.corpus import TASK
 
 
@@ -744,3 +747,110 @@ def test_places_that_take_no_file_are_refused_first(place):
 
     with pytest.raises(UserError, match="could not be written"):
         writable(place)
+
+
+def test_small_files_that_claim_a_lot(tmp_path, in_time):
+    import tracemalloc
+
+    for what, read, sound in strange_files.bombs(tmp_path / "bombs"):
+        tracemalloc.start()
+        found = []
+        tried(what, lambda read=read, found=found: found.append(read()))
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert all(map(sound, found)) and most < 2**29, what
+
+
+@pytest.mark.parametrize("name", ["minari", "lerobot"])
+def test_fields_of_importers_files(name, tmp_path):
+    """Junk in every field, and other bytes, of what lies beside the arrays."""
+    read = strange_files.FORMATS[name](tmp_path)
+    file = next(tmp_path.rglob("*.json"))
+    raw = file.read_bytes()
+    for what, content in strange_files.changes(file, raw, random.Random(6), 1):
+        file.write_bytes(content)
+        tried(what, read)
+    file.write_bytes(raw)
+    assert strange_files.sound(read())
+
+
+def test_logs_of_thousands_are_looked_at(in_time):
+    rng = np.random.default_rng(0)
+
+    def logs(agents, entries, names=None):
+        seen = rng.normal(size=(2, 131, agents, entries)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (2, 130, agents, 2))
+        card = {"task": "wide", "observation_names": names}
+        return EpisodeStore.from_episodes(seen, actions, np.zeros((2, 130)), np.zeros((2, 130)), card=card)
+
+    assert audit(logs(1, 3000)).facts["observation, action"] == "3000, 2 per agent"
+    assert audit(logs(1, 400, [f"person0_d{k}" for k in range(400)])).warnings
+    assert audit(logs(400, 2, ["own.x", "other0.dx"])).facts["agents"] == "400"
+
+
+def test_metrics_and_constants_of_strangers(trained_run, tmp_path):
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "bc" / "seed-0"))
+    odd = [{"step": 3, "seconds": 1.0, "a": "x", "b": None, "c": -1e308, "d": [1], "e": True, "f": 2.0}]
+    (run.path / "metrics.jsonl").write_text("\n".join(map(json.dumps, odd)) + "\n")
+    assert run.metrics == [{"step": 3, "seconds": 1.0, "f": 2.0}]
+    with pytest.raises(UserError, match="constants say that 0 and 1 are the same"):
+        normal_return(1.0, {"return_min": 3.0, "return_max": 3.0})
+    for _, file in run.checkpoints():
+        file.unlink()
+        file.mkdir()
+    with pytest.raises(UserError, match="holds no checkpoint"):
+        load(run)
+
+
+THINGS = [3, None, [], {}, b"x", len, np.zeros(3)]
+
+
+@pytest.mark.parametrize("value", THINGS, ids=repr)
+def test_things_of_other_kinds_are_refused_by_name(value, tmp_path):
+    store = corpus.small_store()
+    table = {"t": np.arange(20.0), "id": np.zeros(20), "x": np.arange(20.0)}
+    how = {"time": "t", "agent": "id", "state": ["x"]}
+    asked = [
+        lambda: EpisodeStore.load(value),
+        lambda: store.save(value),
+        lambda: ringfence.load_world(value),
+        lambda: ringfence.undelay(value, 1),
+        lambda: ringfence.replay(None, value),
+        lambda: ringfence.train(value, store),
+        lambda: store.followed_by(value),
+        lambda: EpisodeStore.from_layout(table, value),
+    ]
+    if value not in (None, {}) if not isinstance(value, np.ndarray) else True:
+        asked.append(lambda: EpisodeStore.from_table(table, **how, card=value))
+        asked.append(lambda: ringfence.collect(strange.Simulator, episodes=1, card=value))
+    if value is not None and value is not len:
+        asked.append(lambda: ringfence.collect(strange.Simulator, value, episodes=1))
+        asked.append(lambda: ringfence.collect(strange.Simulator, episodes=1, cost=value))
+    for ask in asked:
+        with pytest.raises(UserError) as refused:
+            ask()
+        assert str(refused.value).isprintable()
+
+
+def test_a_card_of_several_agents_is_of_no_split_team():
+    store = corpus.small_store()
+    with pytest.raises(UserError, match="team=7, which logs of single agents have"):
+        dataclasses.replace(store, card=store.card.updated(team=7))
+
+
+def test_cards_of_worlds_say_nothing_to_a_terminal():
+    from ringfence.world.card import Card, Data, HeldOut
+
+    card = Card(data=Data(task="\x1b]52;c;eA==\x07", hazard={"kind": "CostColumn"}), held_out=HeldOut(1, 2))
+    assert "\x1b" not in str(card) and "\\x1b]52" in str(card)
+
+
+def test_names_that_are_missing_are_no_agents():
+    times = np.array(["NaT", "2020-01-01"], "datetime64[s]")
+    with pytest.raises(UserError, match="row 0: id is missing"):
+        strange.tabled(strange.columns(id=np.repeat(times, 20)))
+    for days in ("datetime64[Y]", "datetime64[M]"):
+        with pytest.raises(UserError, match="counts years or months"):
+            strange.tabled(strange.columns(t=np.tile(np.arange(20), 2).astype(days)))
+    with pytest.raises(UserError, match="row 0: t is"):
+        strange.tabled(strange.columns(t=np.tile([f"0001-01-01T00:00:{k:02d}+14:00" for k in range(20)], 2)))

@@ -184,7 +184,7 @@ def test_damaged_files_are_named(tmp_path, few):
         with pytest.raises(StoreError, match=r"acs_1\.npy' is truncated"):
             import_omar(folder)
     np.save(file, np.array([None] * 200))
-    with pytest.raises(StoreError, match=r"acs_1\.npy' is truncated or no .npy file of numbers"):
+    with pytest.raises(StoreError, match=r"acs_1\.npy' is truncated, damaged or no .npy file of numbers"):
         import_omar(folder)
     np.save(file, np.array([["a", "b"]] * 200))
     with pytest.raises(StoreError, match=r"acs_1\.npy' holds <U1, not numbers"):

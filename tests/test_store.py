@@ -71,7 +71,7 @@ def test_truncated_file_is_refused(tmp_path, small_store, share):
     path = small_store.save(tmp_path / "s.h5")
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(StoreError, match=r"s\.h5.*truncated or not HDF5"):
+    with pytest.raises(StoreError, match=r"s\.h5.*truncated, damaged or no episode store"):
         EpisodeStore.load(path)
 
 
@@ -90,7 +90,7 @@ def test_a_group_is_no_array(tmp_path, name):
     [
         ("null", "got `null`"),
         ("[]", "got `array`"),
-        ("{", "has no card"),
+        ("{", "no episode store .Input data was truncated"),
         ('{"hazard": null}', "hazard=None; it must be a Separation"),
         ('{"hazard": "near"}', "hazard='near'; it must be"),
         ('{"hazard": {"kind": "All", "hazards": [3]}}', "which is none"),
@@ -607,10 +607,26 @@ def test_a_file_that_cannot_be_read_is_refused_like_a_damaged_one(tmp_path, monk
 
     monkeypatch.setattr(h5py, "File", denied)
     monkeypatch.setattr(pathlib.Path, "open", denied)
-    with pytest.raises(StoreError, match=r"s\.h5' is truncated or not HDF5 \(Permission denied\)"):
+    with pytest.raises(StoreError, match=r"s\.h5' is truncated, damaged or no episode store \(Permission denied\)"):
         EpisodeStore.load(tmp_path / "s.h5")
 
 
 def test_flat_logs_need_the_state_that_each_episode_ended_in():
     with pytest.raises(StoreError, match="no final_observations .* give the last observation of each episode"):
         EpisodeStore.from_steps(np.zeros((4, 2, 3)), np.zeros((4, 2, 1)), np.zeros(4), episode_ends=[4])
+
+
+@pytest.mark.parametrize("room", [0, 600, 5000, 60_000])
+def test_a_full_disk_is_told_and_leaves_nothing(room, small_store, tmp_path):
+    """HDF5 that meets it in the middle keeps the file half open, and ends the process when the interpreter goes."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        with pytest.raises(UserError, match="could not be written .*free some space"):
+            small_store.save(tmp_path / "s.h5")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir()) and h5py.h5f.get_obj_count() == 0
+    assert EpisodeStore.load(small_store.save(tmp_path / "s.h5")).content == small_store.content

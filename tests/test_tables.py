@@ -286,7 +286,7 @@ def test_files_that_are_no_tables_are_refused(tmp_path):
     for name, content in odd:
         (tmp_path / name).write_bytes(content)
         with pytest.raises(
-            UserError, match="no table that can be read|ends in|column of the table|twice, or no header"
+            UserError, match="no table that can be read|no Parquet file|ends in|column of the table|twice, or no header"
         ):
             EpisodeStore.from_table(tmp_path / name, **NAMES)
 

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import operator
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 LAST_SEED = 2**31 - 1  # that JAX takes everywhere
+LONGEST = 4000  # letters of a message
+SHOWN = 100  # names that a refusal lists
+LONG = 60  # letters of each of them
 
 
 class UserError(ValueError):
     """Bad input, refused before work starts. The command line prints the message alone, without a traceback, so what
-    it quotes of a stranger's file is kept from breaking lines or speaking to the terminal."""
+    it quotes of a stranger's file is kept from breaking lines, speaking to the terminal or filling it."""
 
     def __str__(self) -> str:
-        return plain(super().__str__())
+        text = super().__str__()
+        if len(text) > LONGEST:
+            text = f"{text[: LONGEST // 2]} … {text[-LONGEST // 4 :]}"
+        return plain(text)
 
 
 class NoSafeAction(UserError):
@@ -60,10 +70,19 @@ def plain(text: str) -> str:
 
 def whole_number(name: str, value, low: int = 0, high: int = 10**9) -> int:
     """A count that somebody gave, in bounds; anything else is refused by its name."""
-    number = value if isinstance(value, int) else getattr(value, "item", lambda: None)()  # NumPy's, too
-    if isinstance(number, bool) or not isinstance(number, int) or not low <= number <= high:
+    try:
+        number = operator.index(value)  # NumPy's, too
+    except TypeError:
+        number = None
+    if isinstance(value, bool) or number is None or not low <= number <= high:
         raise UserError(f"{name}={str(value)[:60]} must be a whole number from {low:,} to {high:,}.")
     return number
+
+
+def of_kind(name: str, value: Any, kind: Any, remedy: str) -> None:
+    """Refuse a value of another kind."""
+    if not isinstance(value, kind):
+        raise UserError(f"{name} is a {type(value).__name__}; {remedy}.")
 
 
 def known(name: str, value: Any, choices: Iterable[str]) -> None:
@@ -72,9 +91,39 @@ def known(name: str, value: Any, choices: Iterable[str]) -> None:
         raise UserError(f"{name}={str(value)[:60]!r} is none of its choices; take one of: {', '.join(choices)}.")
 
 
-def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
-    """`UserError` for a name that is not in `known`, suggesting the nearest one."""
-    known = sorted(known)
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+def unknown(kind: str, name: Any, known: Iterable[str]) -> UserError:
+    """`UserError` for a name that is not in `known`, suggesting the nearest one. A file may know millions."""
+    known = sorted(islice(known, 10 * SHOWN))
+    name = str(name)[:LONGEST]
+    near = difflib.get_close_matches(name[:LONG], [one[:LONG] for one in known], n=1, cutoff=0.4)
     hint = f"did you mean '{near[0]}'? Known:" if near else "choose one of:"
-    return UserError(f"Unknown {kind} '{name}'; {hint} {', '.join(known)}.")
+    more = f" and {len(known) - SHOWN} more" if len(known) > SHOWN else ""
+    return UserError(f"Unknown {kind} '{name}'; {hint} {', '.join(one[:LONG] for one in known[:SHOWN])}{more}.")
+
+
+def one_of(kind: str, name: Any, known: Mapping[str, T]) -> T:
+    """What is called so; a name that is not in `known`, or no name, is refused."""
+    if not isinstance(name, str) or name not in known:
+        raise unknown(kind, name, known)
+    return known[name]
+
+
+def reason(error: BaseException) -> str:
+    """Why, in one line: the first of what a library says."""
+    lines = str(error).strip().splitlines()
+    kind = "" if isinstance(error, OSError | ValueError) and lines else type(error).__name__
+    return ": ".join(part for part in (kind, lines[0][:200].rstrip(".") if lines else "") if part)
+
+
+@contextmanager
+def reading(
+    path: str | Path, what: str, remedy: str = "copy it again", kind: type[UserError] = StoreError
+) -> Iterator[None]:
+    """Read what a stranger wrote, which is to be `what`: anything that a library raises at it, documented or not,
+    becomes a refusal that names the file."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise kind(f"'{path}' is truncated, damaged or no {what} ({reason(error)}); {remedy}.") from error

@@ -14,7 +14,7 @@ from ringfence.algos.naive import NAIVE
 from ringfence.algos.omar import MA_CQL, OMAR
 from ringfence.algos.returns import BC_BEST, BC_RETURN
 from ringfence.algos.td3bc import MA_TD3BC, MA_TD3BC_LAG
-from ringfence.errors import unknown
+from ringfence.errors import one_of
 from ringfence.types import Algorithm
 from ringfence.utils.config import build_config
 
@@ -24,9 +24,7 @@ ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, FLOW, MPC, NAIVE, *_BC, *_CRITIC
 
 def get(name: str) -> Algorithm:
     """The algorithm of that name; an unknown one is refused with the nearest name."""
-    if name not in ALGORITHMS:
-        raise unknown("algorithm", name, ALGORITHMS)
-    return ALGORITHMS[name]
+    return one_of("algorithm", name, ALGORITHMS)
 
 
 def configured(algorithm: Algorithm, preset: str, changes: Mapping[str, Any]) -> Any:

@@ -16,7 +16,7 @@ import lzma
 import tarfile
 from pathlib import Path, PurePosixPath
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, reading
 from ringfence.training.runs import write_json
 from ringfence.utils import schemas
 from ringfence.utils.files import regular, whole, within
@@ -27,6 +27,7 @@ ARCHIVES = {
     "curves.tar.xz": ("metrics.jsonl",),
 }
 LARGEST = 2**29  # bytes of an archive, unpacked
+MANY = 20_000  # files in an archive; the largest of ours holds 2,700
 LONGEST = 200  # bytes of a name in a path: `whole` adds some of its own to them
 MARK = Path("cells", ".unpacked.json")  # digests of the archives whose files are loose
 
@@ -51,12 +52,12 @@ def unpack(out: str | Path) -> None:
         if done == digests:
             return
     for archive in archives:
-        try:
+        with reading(archive, "archive of results", "restore that file", UserError):
             with tarfile.open(fileobj=io.BytesIO(_content(archive))) as tar:
-                for member in tar:
+                for number, member in enumerate(tar):
+                    if number >= MANY:
+                        raise ValueError(f"it holds more than {MANY:,} files")
                     _place(out, archive, member, tar)
-        except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
-            raise UserError(f"'{archive}' is truncated or damaged ({error}); restore that file.") from error
     write_json(out / MARK, digests)
 
 

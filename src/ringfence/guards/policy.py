@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import NoSafeAction, UserError, unknown
+from ringfence.errors import NoSafeAction, UserError, one_of, unknown
 from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions, in_steps
@@ -310,8 +310,7 @@ def build(
 ) -> Guarded:
     """A policy under the named guard with changed options; `usual` as in `options_of`, by default what the World's card
     asks for. A World that is unfit to guard by is refused unless it is insisted on with `anyway`."""
-    if name not in GUARDS:
-        raise unknown("guard", name, GUARDS)
+    one_of("guard", name, GUARDS)
     if barrier != "analytic":
         require(world.card, anyway)
     if usual is None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, of_kind, whole_number
 from ringfence.guards.policy import Guarded, build
 from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import (
@@ -144,6 +144,11 @@ def under_guard(
     """A policy of the library, or any callable, under guard; the arguments are those of `ringfence.guard`."""
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
+    of_kind("guard", guard, str, "give a guard's name")
+    of_kind("barrier", barrier, str, "give learned, analytic or both")
+    of_kind("hazard", hazard, constraints.Hazard | None, "give a Separation, SpeedLimit, CostColumn or All")
+    if agents is not None:
+        whole_number("agents", agents, 1)
     if isinstance(policy, PerAgent):
         return PerAgent(build(policy.one, world, hazard, guard, barrier, anyway=anyway, **options), policy.agents)
     if isinstance(policy, Policy):

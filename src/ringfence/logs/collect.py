@@ -60,8 +60,10 @@ def collect(
     whole_number("episodes", episodes, 1)
     whole_number("seed", seed, 0, 2**31)
     whole_number("max_episode_steps", max_episode_steps, 1)
-    given_card(card or {})
+    given_card(card)
     file = None if out is None else writable(out)
+    if cost is not None and not callable(cost):
+        raise UserError(f"cost is a {type(cost).__name__}; give a function of the infos of a step.")
     env = made(make_env, "action_space")
     player = _Player.of(policy)
     if file is not None:
@@ -178,6 +180,8 @@ class _Player:
 
     @classmethod
     def of(cls, policy: Any) -> _Player:
+        if policy is not None and not callable(getattr(policy, "act", policy)):
+            raise UserError(f"policy is a {type(policy).__name__}; give a function of observations, or what has `act`.")
         if policy is None:
             return cls("uniform", None, lambda: None)
         name = getattr(policy, "__qualname__", type(policy).__name__)

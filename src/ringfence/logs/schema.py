@@ -26,6 +26,7 @@ LARGEST = 1e15  # entry of an array: its square, and sums of that, are still num
 OPTIONAL = ("state", "speed", "constraints")
 ROWS = ("observations", "state")  # arrays with one row more than steps in every episode
 LIKELY = 0.85  # similarity of two names, from which one is taken for the other mistyped
+WORDS = ("simulator", "provenance", "content")
 LISTS_OF_NAMES = ("observation_names", "state_names")
 ALWAYS = (
     "task",
@@ -152,9 +153,10 @@ def complete_card(given: GivenCard) -> StoreCard:
     return StoreCard(**known, extra=extra, written=tuple(values))
 
 
-def given_card(given: GivenCard) -> StoreCard:
-    """The card of fields that somebody wrote by hand: what looks like a known field, mistyped, is refused. Cards in
-    files are read by `complete_card` alone, whatever they hold."""
+def given_card(given: GivenCard | None) -> StoreCard:
+    """The card of fields that somebody wrote by hand, if any: what looks like a known field, mistyped, is refused.
+    Cards in files are read by `complete_card` alone, whatever they hold."""
+    given = {} if given is None else given
     for name in given if isinstance(given, dict) else ():
         near = difflib.get_close_matches(str(name), FIELDS, n=1, cutoff=LIKELY)
         if near and name not in FIELDS:
@@ -205,7 +207,7 @@ def _constraint_limits(card: dict) -> None:
 
 
 def _lists_of_words(card: dict) -> None:
-    for name in (*LISTS_OF_NAMES, "warnings"):
+    for name in (*LISTS_OF_NAMES, "agents", "warnings"):
         words = card.get(name)
         words = words.tolist() if isinstance(words, np.ndarray) else words
         if words is not None and not (isinstance(words, list | tuple) and all(isinstance(w, str) for w in words)):
@@ -221,6 +223,18 @@ def _lists_of_words(card: dict) -> None:
             card[name] = words if words is None else list(words)
         if words and name in LISTS_OF_NAMES:
             _names_differ(name, list(words))
+
+
+def _words(card: dict) -> None:
+    for name in WORDS:
+        if not isinstance(card.get(name), str | None):
+            raise StoreError(f"The card has {name}={repr(card[name])[:200]}; it must be text, or be left out.")
+
+
+def _sensing_radius(card: dict) -> None:
+    radius = card.get("sensing_radius")
+    if radius is not None and not (radius == math.inf or (_is_number(radius) and radius > 0)):
+        raise StoreError(f"The card has sensing_radius={repr(radius)[:200]}; it must be a number of metres above 0.")
 
 
 def _origins(card: dict) -> None:
@@ -291,7 +305,9 @@ CARD_RULES: tuple[Callable[[dict], None], ...] = (
     _action_bounds,
     _cost_limit,
     _constraint_limits,
+    _words,
     _lists_of_words,
+    _sensing_radius,
     _origins,
     _seconds_of_a_step,
     _team,
@@ -533,6 +549,15 @@ def _action_sizes(store: Arrays) -> None:
     )
 
 
+def _team_of_one(store: Arrays) -> None:
+    n_agents = store.actions.shape[1]
+    _demand(
+        store.card.team is None or n_agents == 1,
+        f"The card has team={store.card.team}, which logs of single agents have that were split from a team's, and the "
+        f"data has {n_agents} agents; leave it out.",
+    )
+
+
 def _names_of_agents(store: Arrays) -> None:
     agents = store.card.agents
     n_agents = store.actions.shape[1]
@@ -575,6 +600,7 @@ STORE_RULES: tuple[Callable[[Arrays], None], ...] = (
     _actions_within_bounds,
     _episodes_end_in_one_way,
     _action_sizes,
+    _team_of_one,
     _names_of_agents,
     _names_of_entries,
     _origins_of_entries,

@@ -29,7 +29,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, unknown
+from ringfence.errors import StoreError, UserError, of_kind, reading, unknown
 from ringfence.logs.io.columns import Tables
 from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import TableSchema
@@ -37,7 +37,7 @@ from ringfence.logs.moving import moved
 from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, given_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
-from ringfence.utils.files import whole
+from ringfence.utils.files import place, whole
 from ringfence.utils.given import refuse_other_order
 from ringfence.utils.pytrees import digest_of
 
@@ -206,6 +206,7 @@ class EpisodeStore:
 
     def followed_by(self, other: EpisodeStore) -> EpisodeStore:
         """These episodes and then the other's, of the same agents; the card is this one's."""
+        of_kind("What follows", other, EpisodeStore, "give an EpisodeStore")
         if (self.state is None) != (other.state is None):
             raise StoreError("One of the stores holds a global state and the other none; leave it out of both.")
         if list(self.limits) != list(other.limits):
@@ -313,7 +314,7 @@ class EpisodeStore:
         steps = e * length
         ends = np.arange(1, e + 1) * length
         states = None if state is None else _rows(state, e * (length + 1))
-        seen, states, card = moved(_rows(observations, e * (length + 1)), states, ends, given_card(card or {}))
+        seen, states, card = moved(_rows(observations, e * (length + 1)), states, ends, given_card(card))
         return cls(
             seen,
             _flat(actions, steps),
@@ -369,7 +370,7 @@ class EpisodeStore:
             rewards = np.repeat(rewards[:, None], n_agents, 1)
         ended = np.zeros(len(ends), bool) if terminated is None else _truths("terminated", terminated)
         seen = np.insert(observations, ends, final_observations, axis=0)
-        seen, states, card = moved(seen, states, ends, given_card(card or {}))
+        seen, states, card = moved(seen, states, ends, given_card(card))
         return cls(
             seen,
             actions,
@@ -448,64 +449,49 @@ class EpisodeStore:
     # --- disk ---
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
-        path = Path(path)
+        path = place(path)
         card = json.dumps(self.card.to_dict())
-        with whole(path) as temporary:
-            try:
-                with h5py.File(temporary, "w") as f:
-                    f.attrs["ringfence_store"] = FORMAT
-                    f.attrs["card"] = card
-                    f.attrs["digest"] = self.content
-                    f.attrs["card_digest"] = _digest(card)
-                    for name in (*ARRAYS, *OPTIONAL):
-                        if getattr(self, name) is not None:
-                            f.create_dataset(name, data=getattr(self, name))
-            except RuntimeError as error:  # HDF5 on a full disk, when it closes the file
-                raise OSError(str(error)) from error
+        with whole(path) as temporary, arrays.written(temporary) as f:
+            f.attrs["ringfence_store"] = FORMAT
+            f.attrs["card"] = card
+            f.attrs["digest"] = self.content
+            f.attrs["card_digest"] = _digest(card)
+            for name in (*ARRAYS, *OPTIONAL):
+                if getattr(self, name) is not None:
+                    f.create_dataset(name, data=getattr(self, name))
         return path
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> EpisodeStore:
         """Read and validate; a foreign, truncated, damaged or invalid file is refused, never read in part."""
-        path = Path(path)
+        path = place(path)
         if not path.exists():
             raise StoreError(f"No episode store at '{path}'; make one with `ringfence data make TASK`.")
         if not path.is_file():
             raise StoreError(f"'{path}' is no regular file; give the file of an episode store.")
-        try:
-            with h5py.File(path, "r") as f:
-                if f.attrs.get("ringfence_store") != FORMAT:
-                    raise StoreError(
-                        f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
-                    )
-                there = _checked(path, f)
-                raw = f.attrs["card"]
-                digest = f.attrs.get("digest")
-                if not isinstance(raw, str | bytes) or len(raw) > 2**24:
-                    raise StoreError(f"'{path}' has no card that can be read; make or import it again.")
-                digest_of_card = _digest(raw)
-                if f.attrs.get("card_digest", digest_of_card) != digest_of_card:
-                    raise StoreError(
-                        f"'{path}' has another card than was written; make or import it again, or delete its "
-                        "attribute 'card_digest' if you wrote the card yourself."
-                    )
-                card = schemas.decode(raw, dict[str, Any])
-                content = {name: array[()] for name, array in there.items()}
-        except StoreError:
-            raise
-        except OSError as error:
-            if _begins_otherwise(path):
-                raise StoreError(
-                    f"'{path}' is no episode store, by its first bytes; import it with `ringfence data`, or give its "
-                    "arrays to EpisodeStore.from_steps."
-                ) from error
-            reason = str(error).splitlines()[0]
+        if _begins_otherwise(path):
             raise StoreError(
-                f"'{path}' is truncated or not HDF5 ({reason}); make or import the store again."
-            ) from error
-        except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise StoreError(f"'{path}' is damaged or has no card ({reason}); make or import it again.") from error
+                f"'{path}' is no episode store, by its first bytes; import it with `ringfence data`, or give its "
+                "arrays to EpisodeStore.from_steps."
+            )
+        with reading(path, "episode store", "make or import it again"), h5py.File(path, "r") as f:
+            if f.attrs.get("ringfence_store") != FORMAT:
+                raise StoreError(
+                    f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
+                )
+            there = _checked(path, f)
+            raw = f.attrs["card"]
+            digest = f.attrs.get("digest")
+            if not isinstance(raw, str | bytes) or len(raw) > 2**24:
+                raise StoreError(f"'{path}' has no card that can be read; make or import it again.")
+            digest_of_card = _digest(raw)
+            if f.attrs.get("card_digest", digest_of_card) != digest_of_card:
+                raise StoreError(
+                    f"'{path}' has another card than was written; make or import it again, or delete its "
+                    "attribute 'card_digest' if you wrote the card yourself."
+                )
+            card = schemas.decode(raw, dict[str, Any])
+            content = {name: array[()] for name, array in there.items()}
         try:
             found = cls(**content, card=complete_card(card))
         except UserError as error:

@@ -1,9 +1,12 @@
 """Arrays of a stranger's HDF5 file, looked at before any of them is read: plain ones, in the file itself, of no more
-bytes than the file can hold and this machine can take."""
+bytes than the file can hold and this machine can take. And files of one's own, on disks that may be full."""
 
 from __future__ import annotations
 
+import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -35,15 +38,49 @@ def array(path: Path, group: h5py.Group, name: str, label: str | None = None) ->
     return found
 
 
-def affordable(path: Path, size: int, ratio: int) -> None:
-    """Refuse arrays of `size` bytes that memory cannot take, or that a file of its size cannot hold though it were
-    compressed `ratio` to one."""
+def affordable(path: Path, size: int, ratio: int, stored: int | None = None, loose: int = LOOSE) -> None:
+    """Refuse arrays of `size` bytes that memory cannot take, or that a file of its size (`stored` bytes, that of
+    `path` by default) cannot hold though it were compressed `ratio` to one."""
     fits(path, size)
-    stored = path.stat().st_size
-    if size > ratio * stored + LOOSE:
+    stored = path.stat().st_size if stored is None else stored
+    if size > ratio * stored + loose:
         raise StoreError(
             f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {stored / 2**20:.1f}; store them uncompressed."
         )
+
+
+@contextmanager
+def written(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file to write. What the disk refuses is raised once the file is closed: HDF5 that meets it in the middle
+    can neither go on nor close, and ends the process with a fault of memory."""
+    with _Patient(path, "w+b") as disk:
+        with h5py.File(disk, "w") as file:
+            yield file
+        if disk.refusal is not None:
+            raise disk.refusal
+
+
+class _Patient(io.FileIO):
+    """A file that takes whatever it is given, and remembers the first thing that its disk did not take."""
+
+    refusal: OSError | None = None
+
+    def write(self, data) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        while left and self.refusal is None:
+            try:
+                left = left[super().write(left) :]
+            except OSError as error:
+                self.refusal = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.refusal = self.refusal or error
+            return size or 0
 
 
 def fits(path: Path, size: int) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, reading
 from ringfence.utils.cache import elsewhere
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
@@ -50,9 +50,17 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
         raise
 
 
+def place(given: str | os.PathLike) -> Path:
+    """The path that somebody gave; what is none is refused."""
+    try:
+        return Path(given)
+    except TypeError:
+        raise UserError(f"{given!r:.60} is no path; give a file's or a folder's.") from None
+
+
 def writable(path: str | os.PathLike) -> Path:
     """The path, links followed, if a file may be written there; refused before any work is done."""
-    path = Path(path)
+    path = place(path)
     if not path.name or not str(path).strip() or "\0" in str(path):
         raise UserError(f"'{path}' names no file; give a file's name.")
     try:
@@ -175,6 +183,16 @@ def owned(folder: Path, taken: str) -> Iterator[int]:
         yield file
     finally:
         os.close(file)
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """An array of numbers, unread until it is used; nothing is unpickled, and a header that lies is refused before it
+    is believed."""
+    with reading(path, ".npy file of numbers"):
+        array = np.load(regular(path), mmap_mode="r", allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise ValueError(f"it holds {getattr(array, 'dtype', 'an archive')}")
+    return array
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

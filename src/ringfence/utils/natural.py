@@ -21,7 +21,7 @@ def natural(name: str) -> tuple[list[str | tuple[int, str]], str]:
 def numbered(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The different names of a column (M,), numbers by value and text in natural order, and (M,) whose is each row."""
     names, owner = np.unique(column, return_inverse=True)
-    if names.dtype.kind != "U":
+    if names.dtype.kind not in "UO":
         return names, owner
     order = sorted(range(len(names)), key=lambda k: natural(str(names[k])))
     return names[order], np.argsort(order)[owner]

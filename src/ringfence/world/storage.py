@@ -19,7 +19,7 @@ from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.types import Spec
 from ringfence.utils import schemas
-from ringfence.utils.files import regular
+from ringfence.utils.files import place, regular
 from ringfence.utils.precision import in_float32
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays, save_named
 from ringfence.world import barrier as cbf
@@ -67,7 +67,7 @@ def save(
     world: World, path: str | Path, kept: Callable[[np.ndarray, str], np.ndarray] = lambda array, name: array
 ) -> Path:
     """Write one file, whole or not at all: arrays, as `kept` makes them, and the card as its metadata."""
-    path = Path(path)
+    path = place(path)
     about: dict[str, Any] = {
         "map": features.to_dict(world.map),
         "spec": world.spec.to_dict(),
@@ -88,7 +88,7 @@ def _digest(arrays: dict[str, np.ndarray], about: Mapping[str, Any]) -> str:
 @in_float32
 def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> World:
     """The World in a file."""
-    path = Path(path)
+    path = place(path)
     try:
         regular(path)
     except ValueError as error:

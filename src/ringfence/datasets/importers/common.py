@@ -15,7 +15,7 @@ from ringfence.datasets.importers import columns
 from ringfence.errors import StoreError
 from ringfence.problem.bounds import Bounds
 
-PACKED = 100  # times its size that a compressed file may unpack to; columns of zeros pack well
+PACKED = 20  # times its size that a compressed file may unpack to; columns of zeros pack well
 
 
 @dataclass(frozen=True)

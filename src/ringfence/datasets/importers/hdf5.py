@@ -32,7 +32,7 @@ import numpy as np
 
 from ringfence.datasets import registry
 from ringfence.datasets.importers import columns, common, minari
-from ringfence.errors import StoreError, UserError
+from ringfence.errors import StoreError, UserError, reading
 from ringfence.logs.schema import complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.utils import arrays, schemas
@@ -69,18 +69,9 @@ def import_hdf5(
     complete_card(known)  # a name that cannot be one is refused before the file is read
     asked = common.Asked(None if agents is None else columns.read(agents), action_low, action_high)
     path = _located(path)
-    try:
-        with h5py.File(path, "r") as f:
-            episodes = _recognised(path, f)
-            log = minari.read(path, f, episodes, asked) if episodes else _flat(path, f, asked)
-    except UserError:
-        raise
-    except OSError as error:
-        said = str(error).splitlines()[0]
-        raise StoreError(f"'{path}' is truncated or not HDF5 ({said}); copy it again.") from error
-    except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
-        said = (str(error).splitlines() or [type(error).__name__])[0]
-        raise StoreError(f"'{path}' is damaged ({said}); copy it again.") from error
+    with reading(path, "HDF5 of DSRL, D4RL or Minari"), h5py.File(path, "r") as f:
+        episodes = _recognised(path, f)
+        log = minari.read(path, f, episodes, asked) if episodes else _flat(path, f, asked)
     return _store(path, log, asked.agents, known)
 
 

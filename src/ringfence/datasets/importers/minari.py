@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 
 from ringfence.datasets.importers import columns, common
-from ringfence.errors import StoreError
+from ringfence.errors import StoreError, reading, reason
 from ringfence.problem.bounds import Bounds
 from ringfence.utils import arrays, schemas
 
@@ -47,14 +47,13 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     notes: list[str] = []
     if isinstance(count := metadata.get("total_episodes"), int | np.integer) and count != len(episodes):
         raise StoreError(f"'{path}' holds {len(episodes)} episodes, its metadata tells of {count}; copy it again.")
-    space = _action_space(path, metadata, asked)
     found = {name: _shapes(path, f, name) for name in episodes}
     first = found[episodes[0]]
     _check_alike(path, found, episodes[0])
     seen, acted = _widths(path, first)
     if asked.agents is not None:
         columns.check(path, asked.agents, seen, acted)
-    bounds = common.bounds_of(space, asked, acted)
+    bounds = common.bounds_of(_action_space(path, metadata, asked, acted), asked, acted)
     arrays.affordable(path, sum(shapes.size for shapes in found.values()), common.PACKED)
 
     found = _with_steps(path, found, notes)
@@ -250,31 +249,27 @@ def _metadata(path: Path, f: h5py.File) -> dict:
     if not file.is_file():
         keys = ("total_episodes", "dataset_id", "env_spec", "action_space")
         return {k: v.decode() if isinstance(v := f.attrs[k], bytes) else v for k in keys if k in f.attrs}
-    try:
+    with reading(file, "metadata of Minari's", "copy it again, or read the HDF5 file without it"):
         if file.stat().st_size > schemas.LARGEST:
             raise ValueError(f"it is larger than {schemas.LARGEST / 2**20:.0f} MiB")
         metadata = json.loads(file.read_bytes())
         if not isinstance(metadata, dict):
             raise ValueError("it is no object")
-    except (OSError, ValueError, RecursionError) as error:
-        raise StoreError(
-            f"'{file}' cannot be read ({error}); copy it again, or read the HDF5 file without it."
-        ) from None
     return metadata
 
 
-def _action_space(path: Path, metadata: dict, asked: common.Asked) -> Bounds | None:
-    """The bounds of Minari's action space, of each entry; None where it has none or they are not asked."""
+def _action_space(path: Path, metadata: dict, asked: common.Asked, entries: int) -> Bounds | None:
+    """The bounds of Minari's action space, of each of so many entries; None where it has none or they are not asked."""
     if "action_space" not in metadata or (asked.low is not None and asked.high is not None):
         return None
     try:
         boxes = list(_boxes(path, json.loads(metadata["action_space"])))
-        low, high = (np.concatenate([_of_entries(box, name) for box in boxes]) for name in ("low", "high"))
+        low, high = (np.concatenate([_of_entries(box, name, entries) for box in boxes]) for name in ("low", "high"))
     except StoreError:
         raise
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+    except Exception as error:  # JSON of any kind: KeyError, TypeError, OverflowError, RecursionError, ...
         raise StoreError(
-            f"'{path}' comes with an action space that cannot be read ({type(error).__name__}: {error}); pass "
+            f"'{path}' comes with an action space that cannot be read ({reason(error)}); pass "
             "action_low and action_high (--action-low, --action-high)."
         ) from None
     if not len(low) or not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -282,10 +277,13 @@ def _action_space(path: Path, metadata: dict, asked: common.Asked) -> Bounds | N
     return Bounds.of(low, high)
 
 
-def _of_entries(box: dict, name: str) -> np.ndarray:
+def _of_entries(box: dict, name: str, most: int) -> np.ndarray:
     """A bound of each entry of a Box, which may be given as one number."""
     bound = np.asarray(box[name], np.float64).ravel()
-    return np.repeat(bound, math.prod(box.get("shape", (1,)))) if len(bound) == 1 else bound
+    size = math.prod(box.get("shape", (1,))) if len(bound) == 1 else len(bound)
+    if not 0 <= size <= most:
+        raise ValueError(f"it has {size:,} entries, the file's actions have {most}")
+    return np.repeat(bound, size) if len(bound) == 1 else bound
 
 
 def _boxes(path: Path, space: dict) -> Iterator[dict]:

@@ -26,13 +26,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ringfence.datasets.importers import common
 from ringfence.datasets.registry import QUANTILE_LIMITS, ROBOT_COST_LIMIT
 from ringfence.envs import SafeMuJoCo, mujoco
 from ringfence.envs.base import Outcome
 from ringfence.envs.mujoco import Parts
-from ringfence.errors import StoreError, UserError, unknown
+from ringfence.errors import StoreError, UserError, reading, unknown
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.utils.arrays import affordable
+from ringfence.utils.files import read_npy
 
 ROBOTS: dict[str, Parts] = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
@@ -511,13 +514,7 @@ def _load(directory: Path, name: str) -> np.ndarray:
         raise StoreError(
             f"'{directory}' lacks {name}.npy; pass a folder of MADIFF's robots (obs.npy, actions.npy, ...)."
         )
-    try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False)  # a header that lies is refused before it is believed
-        if array.dtype.kind not in "biuf":
-            raise ValueError(f"it holds entries of type {array.dtype}")
-        return array
-    except (OSError, ValueError, EOFError) as error:
-        raise StoreError(f"'{file}' is truncated or no .npy file of numbers ({error}); copy it again.") from error
+    return read_npy(file)
 
 
 def _read_vault(vault: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
@@ -532,29 +529,28 @@ def _read_vault(vault: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
         below = sorted({str(f.parent.relative_to(vault)) for f in vault.glob("*/metadata.json")})
         hint = f"; pass one of its subfolders: {', '.join(below)}" if below else ""
         raise StoreError(f"'{vault}' holds no metadata.json, so it is no Vault{hint}.")
-    try:
+    with reading(file, "Vault's metadata", "copy the Vault again"):
         shapes = json.loads(file.read_text())["structure_shape"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"'{file}' is damaged ({error}); copy the Vault again.") from error
+        names = [name for name in _leaves(shapes) if name in wanted]
+    stored = sum(part.stat().st_size for part in vault.rglob("*") if part.is_file())
 
     def read(name: str, cut: slice | None = None) -> np.ndarray:
         base = {"driver": "ocdbt", "base": f"file://{vault.resolve()}", "path": name}
-        try:
+        with reading(vault / name, "array of a Vault", "copy the Vault again"):
             array = tensorstore.open({"driver": "zarr", "kvstore": base}).result()
-            return np.asarray((array if cut is None else array[:, cut]).read().result())
-        except ValueError as error:
-            raise StoreError(
-                f"The array '{name}' of '{vault}' is missing or damaged ({str(error)[:80]}); copy the Vault again."
-            ) from error
-
-    def leaves(tree: dict[str, Any], lead: str = "") -> Iterator[str]:
-        for name, part in tree.items():
-            if isinstance(part, dict):
-                yield from leaves(part, f"{lead}{name}.")
-            else:
-                yield f"{lead}{name}"
+            array = array if cut is None else array[:, cut]
+            affordable(vault, array.dtype.numpy_dtype.itemsize * array.size, common.PACKED, stored)
+            return np.asarray(array.read().result())
 
     steps = int(read("vault_index")[0])
     if steps < 2:
         raise StoreError(f"'{vault}' holds {steps} steps; it was never filled.")
-    return {name: read(f"{name}.", slice(steps)) for name in leaves(shapes) if name in wanted}
+    return {name: read(f"{name}.", slice(steps)) for name in names}
+
+
+def _leaves(tree: dict[str, Any], lead: str = "") -> Iterator[str]:
+    for name, part in tree.items():
+        if isinstance(part, dict):
+            yield from _leaves(part, f"{lead}{name}.")
+        else:
+            yield f"{lead}{name}"

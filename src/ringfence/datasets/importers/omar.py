@@ -31,7 +31,7 @@ from ringfence.errors import StoreError
 from ringfence.logs.schema import complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.utils.files import regular
+from ringfence.utils.files import read_npy
 
 REQUIRED = ("obs", "acs", "rews", "dones")  # next_obs may be absent
 TIER = re.compile(r"(?:simple_spread[-_])?(medium[-_]replay|medium|expert|random)")
@@ -305,12 +305,7 @@ def _agents(directory: Path, kind: str, n: int, rows: int | None, width: int | N
     columns = []
     for i in range(n):
         file = directory / f"{kind}_{i}.npy"
-        try:
-            array = np.load(regular(file), mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise StoreError(f"'{file}' is truncated or no .npy file of numbers ({error}); copy it again.") from error
-        if array.dtype.kind not in "fbiu":
-            raise StoreError(f"'{file}' holds {array.dtype}, not numbers; save it as float32 or float64.")
+        array = read_npy(file)
         if width is None and array.ndim == 2 and array.shape[1] == 1:
             array = array[:, 0]
         expected = "(M,)" if width is None else f"(M, {width})"

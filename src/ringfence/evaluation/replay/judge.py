@@ -12,7 +12,7 @@ import numpy as np
 
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
-from ringfence.errors import LAST_SEED, UserError, known, whole_number
+from ringfence.errors import LAST_SEED, UserError, known, of_kind, whole_number
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.replay.drivers import DRIVERS
 from ringfence.evaluation.replay.motion import kinematics_of
@@ -90,6 +90,7 @@ def replay(
     driver under each filter shows its progress.
     """
     keep_programs()
+    of_kind("store", store, EpisodeStore, "give an EpisodeStore")
     _check(drivers, guard, windows, steps, seed)
     run = None if policy is None else Run.of(policy)
     logs = Logs.of(store, run)
@@ -253,6 +254,7 @@ def _verdict(world: World | None) -> str | None:
 
 
 def _check(drivers: Sequence[str], guard: str, windows: int, steps: int | None, seed: int) -> None:
+    of_kind("drivers", drivers, Sequence, "give a list of their names")
     for name in drivers:
         known("driver", name, DRIVERS)
     known("guard", guard, GUARDS)

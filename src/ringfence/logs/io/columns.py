@@ -16,21 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, unknown
+from ringfence.errors import StoreError, UserError, reading, reason, unknown
 from ringfence.logs.io.jsonlines import read_json_lines
 from ringfence.logs.io.obsmat import read_obsmat
+from ringfence.logs.io.parquet import as_numpy, names_in, read_parquet
 from ringfence.logs.io.sumo import read_fcd
 
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
 Tables = Table | list[Table] | tuple[Table, ...]  # one, or several recordings
 Columns = dict[str, np.ndarray]
-READERS: dict[str, Callable[[Path], Columns]] = {
-    ".jsonl": read_json_lines,
-    ".ndjson": read_json_lines,
-    ".xml": read_fcd,
-    ".txt": read_obsmat,
-}
-KINDS = (".csv", ".parquet", ".pq", *READERS)
+READERS: dict[str, Callable[[Path], Columns]] = {".xml": read_fcd, ".txt": read_obsmat}
+LINES = (".jsonl", ".ndjson")
+PARQUET = (".parquet", ".pq")
+KINDS = (".csv", *PARQUET, *LINES, *READERS)
 
 
 @dataclass(frozen=True)
@@ -55,10 +53,10 @@ def read_columns(table: Table, wanted: Iterable[str], form: Form = AS_USUAL) -> 
             there = np.any([[entry is not None for entry in table[name]] for name in wanted], 0)
             table = {name: table[name][there] for name in wanted}
     if isinstance(table, Mapping):
-        found = {name: _array(name, table[name]) for name in _known(wanted, list(table))}
+        found = {name: _array(name, table[name]) for name in known(wanted, list(table))}
     else:
         frame = _frame(table)
-        found = {name: frame[name].to_numpy() for name in _known(wanted, frame.columns)}
+        found = {name: _of_frame(name, frame[name]) for name in known(wanted, frame.columns)}
     lengths = {len(column) if column.ndim in (1, 2) else -1 for column in found.values()}
     if len(lengths) != 1 or not lengths - {-1, 0}:
         shapes = ", ".join(f"{name} {column.shape}" for name, column in found.items())
@@ -78,9 +76,9 @@ def seconds(columns: Columns, name: str) -> np.ndarray:
     column = columns[name]
     if column.dtype.kind not in "Mm":
         return numbers(columns, name)
-    missing = np.isnat(column)
-    if missing.any():
-        raise StoreError(f"row {int(np.flatnonzero(missing)[0])}: {name} is missing; fill or drop it.")
+    _refuse_missing(name, np.isnat(column))
+    if np.datetime_data(column.dtype)[0] in "YM":
+        raise StoreError(f"{name} counts years or months, which are of several lengths; give dates of days or less.")
     return (column - column.min() if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
 
 
@@ -94,11 +92,11 @@ def dates(column: np.ndarray, written: str | None = None) -> np.ndarray:
             found = [datetime.fromisoformat(entry) for entry in column.tolist()]
         else:
             found = [datetime.strptime(entry, written) for entry in column.tolist()]
-    except (TypeError, ValueError):
+        plain = [one if one.tzinfo is None else one.astimezone(UTC).replace(tzinfo=None) for one in found]
+    except (TypeError, ValueError, OverflowError):  # of the first day of year 1, further east
         return column
     if len({one.tzinfo is None for one in found}) > 1:
         return column
-    plain = [one if one.tzinfo is None else one.astimezone(UTC).replace(tzinfo=None) for one in found]
     return np.array(plain, "datetime64[us]")
 
 
@@ -151,15 +149,19 @@ def numbers(columns: Columns, name: str) -> np.ndarray:
 def words(columns: Columns, name: str) -> np.ndarray:
     """A column of names: numbers as they are, text decoded; a missing entry is refused by its row."""
     column = columns[name]
-    if column.dtype.kind == "f" and not np.isfinite(column).all():
-        row = int(np.flatnonzero(~np.isfinite(column))[0])
-        raise StoreError(f"row {row}: {name} is missing; fill or drop it.")
+    if column.dtype.kind in "fMm":
+        _refuse_missing(name, ~np.isfinite(column))
     if column.dtype.kind not in "OS":
         return column
-    missing = [row for row, entry in enumerate(column) if is_missing(entry)]
-    if missing:
-        raise StoreError(f"row {missing[0]}: {name} is missing; fill or drop it.")
-    return np.array([_text(name, row, entry) for row, entry in enumerate(column)])
+    _refuse_missing(name, np.fromiter(map(is_missing, column), bool, len(column)))
+    found = np.empty(len(column), object)  # NumPy's own text takes as much for each row as the longest
+    found[:] = [_text(name, row, entry) for row, entry in enumerate(column)]
+    return found
+
+
+def _refuse_missing(name: str, missing: np.ndarray) -> None:
+    if missing.any():
+        raise StoreError(f"row {int(np.flatnonzero(missing)[0])}: {name} is missing; fill or drop it.")
 
 
 def _text(name: str, row: int, entry: Any) -> str:
@@ -171,7 +173,7 @@ def _text(name: str, row: int, entry: Any) -> str:
         raise StoreError(f"row {row}: {name} is {entry[:40]!r}, no text in UTF-8; write it anew in that.") from None
 
 
-def _known(wanted: list[str], names: list[Any]) -> list[str]:
+def known(wanted: list[str], names: list[Any]) -> list[str]:
     there = set(names)
     for name in wanted:
         if name not in there:
@@ -199,20 +201,26 @@ def is_missing(entry: Any) -> bool:
 
 def _frame(table: Any) -> Any:
     """A data frame of any library as narwhals' own."""
-    narwhals = _needs("narwhals")
+    narwhals = needs("narwhals")
     try:
         return narwhals.from_native(table, eager_only=True)
     except Exception as error:  # names of columns that are no words, or there twice: each library has its own refusal
         if not isinstance(error, TypeError):
-            said = (str(error).splitlines() or [type(error).__name__])[0]
-            raise StoreError(f"The table cannot be read ({said}); give every column its own name, in words.") from error
+            raise StoreError(
+                f"The table cannot be read ({reason(error)}); give every column its own name, in words."
+            ) from error
         raise StoreError(
             f"The table is a {type(table).__name__}; give a data frame (pandas, polars, pyarrow), a dictionary of "
             "columns, or a .csv or .parquet file."
         ) from None
 
 
-def _needs(module: str) -> ModuleType:
+def _of_frame(name: str, column: Any) -> np.ndarray:
+    """A column of narwhals' as NumPy's."""
+    return as_numpy(name, column.to_native()) if column.implementation.is_pyarrow() else column.to_numpy()
+
+
+def needs(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -222,20 +230,19 @@ def _needs(module: str) -> ModuleType:
 
 
 def _read_file(path: Path, wanted: list[str] | None, form: Form) -> Columns:
-    """The wanted columns of a file; all of them where nothing is wanted."""
+    """The wanted columns of a file; of others, and of all where nothing is wanted, there may be no more than names."""
     kind = path.suffix.lower()
     if not path.is_file():
         raise StoreError(f"'{path}' is no file; give a {_or(KINDS)} file.")
-    if form.header and kind not in (".parquet", ".pq", ".jsonl", ".ndjson", ".xml"):
-        return _read_by_arrow(path, wanted, form)
-    if kind not in KINDS:
+    told = bool(form.header) and kind not in (*PARQUET, *LINES, ".xml")  # any text, whose columns are named
+    if kind not in KINDS and not told:
         raise StoreError(f"'{path}' ends in '{kind}'; give a {_or(KINDS)} file.")
-    if kind in READERS:
-        try:
+    with reading(path, "table that can be read", "write it again"):
+        if kind in READERS and not told:
             return READERS[kind](path)
-        except (OSError, UnicodeDecodeError) as error:
-            raise StoreError(f"'{path}' is no table that can be read ({error}).") from None
-    return _read_by_arrow(path, wanted, form)
+        if kind in LINES:
+            return read_json_lines(path, wanted)
+        return _read_by_arrow(path, wanted, form)
 
 
 def _or(kinds: Iterable[str]) -> str:
@@ -245,22 +252,20 @@ def _or(kinds: Iterable[str]) -> str:
 
 def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
     """Columns of a text or Parquet file."""
-    pyarrow = _needs("pyarrow")
-    try:
-        parquet = path.suffix.lower() in (".parquet", ".pq")
-        table = _read_parquet(path, wanted) if parquet else _read_csv(path, form)
-        names = table.column_names
-        twice = [name for name, times in Counter(names).items() if times > 1]
-        if twice:
-            raise StoreError(
-                f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name."
-            )
-        return {name: table.column(name).to_numpy() for name in (names if wanted is None else _known(wanted, names))}
-    except UserError:
-        raise
-    except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:  # a header that is no UTF-8 among them
-        said = (str(error).splitlines() or [type(error).__name__])[0]
-        raise StoreError(f"'{path}' is no table that can be read ({said}).") from None
+    needs("pyarrow")
+    table = None if path.suffix.lower() in PARQUET else _read_csv(path, form)
+    names = names_in(path) if table is None else table.column_names
+    _refuse_twice(path, names)
+    if wanted is None:
+        return dict.fromkeys(names, np.zeros(0))
+    known(wanted, names)
+    return read_parquet([path], wanted) if table is None else {name: table.column(name).to_numpy() for name in wanted}
+
+
+def _refuse_twice(path: Path, names: list[str]) -> None:
+    twice = [name for name, times in Counter(names).items() if times > 1]
+    if twice:
+        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
 
 
 def _read_csv(path: Path, form: Form) -> Any:
@@ -288,29 +293,6 @@ def _read_csv(path: Path, form: Form) -> Any:
             decimal_point=form.decimal,
         ),
     )
-
-
-def _read_parquet(path: Path, wanted: list[str] | None) -> Any:
-    """An Arrow table; a file that claims to unpack to far more than it holds is refused unread."""
-    from pyarrow import parquet
-
-    with parquet.ParquetFile(path) as file:
-        groups = range(file.metadata.num_row_groups)
-        size = sum(file.metadata.row_group(k).total_byte_size for k in groups)
-        if size > 100 * path.stat().st_size + 2**28:
-            raise StoreError(f"'{path}' claims {size / 2**20:.0f} MiB and holds far less; write it again.")
-        there = set(file.schema_arrow.names)
-        if wanted is None or not set(wanted) <= there:
-            return file.schema_arrow.empty_table()  # for its names
-        _affordable(path, file.metadata.num_rows, len(set(wanted)))
-        return file.read(wanted)
-
-
-def _affordable(path: Path, rows: int, columns: int) -> None:
-    """Refuse what unpacks to far more than a file of its size holds: runs of one value are stored as one."""
-    size = 8 * rows * columns
-    if size > 100 * path.stat().st_size + 2**28:
-        raise StoreError(f"'{path}' unpacks to {size / 2**20:.0f} MiB and holds far less; write it in parts.")
 
 
 def _reads_as_number(entry: Any) -> bool:

@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ringfence.errors import StoreError
+from ringfence.utils.arrays import affordable
 
 DEPTH = 8  # objects within objects
+PACKED = 20  # times its size that a file may unpack to: a row has few bytes that names few columns
 
 
-def read_json_lines(path: Path) -> dict[str, np.ndarray]:
-    """Columns (M,) by name; what a row does not name is None there. Lists stay lists."""
-    columns: dict[str, list[Any]] = {}
+def read_json_lines(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
+    """The wanted columns (M,) by name, and the names of all others without a row; what a row does not name is None
+    there. Lists stay lists."""
+    names: dict[str, None] = {}
+    found: dict[str, tuple[list[int], list[Any]]] = {name: ([], []) for name in wanted or ()}  # rows and their values
     rows = 0
     with path.open(encoding="utf-8-sig") as file:
         for number, line in enumerate(file, 1):
             if not line.strip():
                 continue
             for name, value in _fields(path, number, line):
-                column = columns.setdefault(name, [])
-                column.extend([None] * (rows - len(column)))
-                column.append(value)
+                names[name] = None
+                if name in found:
+                    found[name][0].append(rows)
+                    found[name][1].append(value)
             rows += 1
-    return {name: _column(values + [None] * (rows - len(values))) for name, values in columns.items()}
+    there = {name: column for name, column in found.items() if name in names}
+    affordable(path, 8 * rows * len(there), PACKED)
+    return dict.fromkeys(names, np.zeros(0)) | {name: _column(rows, *column) for name, column in there.items()}
 
 
 def _fields(path: Path, number: int, line: str) -> Iterator[tuple[str, Any]]:
@@ -57,9 +64,9 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return row
 
 
-def _column(values: list[Any]) -> np.ndarray:
+def _column(rows: int, where: list[int], values: list[Any]) -> np.ndarray:
     """Numbers as numbers and words as words; anything else as it is, for whoever reads the column to judge."""
-    kinds = {type(value) for value in values}
+    kinds = {type(value) for value in values} if len(values) == rows else {type(None)}
     if kinds <= {int, float}:
         try:
             return np.array(values, np.int64 if kinds == {int} else np.float64)  # ids are longer than floats are exact
@@ -67,6 +74,7 @@ def _column(values: list[Any]) -> np.ndarray:
             pass
     if kinds == {bool}:
         return np.array(values)
-    column = np.empty(len(values), object)
-    column[:] = values
+    column = np.empty(rows, object)
+    for row, value in zip(where, values):  # lists, which NumPy would make into more axes
+        column[row] = value
     return column

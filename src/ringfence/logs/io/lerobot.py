@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, unknown
-from ringfence.logs.io.columns import Columns, Table, read_columns
+from ringfence.errors import StoreError, UserError, reading, unknown
+from ringfence.logs.io.columns import Columns, Table, known, needs, numbers
+from ringfence.logs.io.lists import stacked
+from ringfence.logs.io.parquet import names_in, read_parquet
 from ringfence.utils.natural import natural
 
 INFO = "meta/info.json"
@@ -51,14 +53,15 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
             raise unknown("column of the data set", name, info.names)
     reward = [REWARD] if REWARD in info.names else []
     read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward])
+    single = {name: next(iter(_by_entry(name, read[name], None).values())) for name in read if name not in wanted}
     own = {name: _by_entry(name, read[name], info.names[name]) for name in wanted}
     states = _joined(own, state)
     actions = own[ACTION]
     agents = _agents(arms, list(actions))
     columns = {
-        "time": read["frame_index"] / info.fps,
-        "episode": read["episode_index"],
-        **({"reward": _arriving(read[REWARD], read["episode_index"])} if reward else {}),
+        "time": numbers(single, "frame_index") / info.fps,
+        "episode": single["episode_index"],
+        **({"reward": _arriving(numbers(single, REWARD), single["episode_index"])} if reward else {}),
     }
     table, names = _by_agent(columns, agents, states, actions)
     frames = len(read["frame_index"])
@@ -80,7 +83,7 @@ class Info:
 def read_info(file: Path) -> Info:
     if not file.is_file():
         raise StoreError(f"'{file.parent.parent}' holds no {INFO}, so it is no LeRobot data set; give its folder.")
-    try:
+    with reading(file, "info.json that LeRobot writes"):
         if file.stat().st_size > LARGEST:
             raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
         info = json.loads(file.read_bytes())
@@ -88,10 +91,6 @@ def read_info(file: Path) -> Info:
         fps = float(info["fps"])
         features = {str(name): _feature_names(feature) for name, feature in info["features"].items()}
         frames = int(info.get("total_frames", 0))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise StoreError(
-            f"'{file}' is not what LeRobot writes ({type(error).__name__}: {error}); copy it again."
-        ) from None
     if not version.startswith(("v2.", "v3.")):
         raise StoreError(
             f"'{file}' is of version {version[:20]} of LeRobot's format; v2 and v3 can be read, so convert it."
@@ -134,21 +133,21 @@ def _read_files(folder: Path, wanted: list[str]) -> Columns:
     files = sorted(folder.glob("data/*/*.parquet"), key=lambda file: natural(str(file)))
     if not files:
         raise StoreError(f"'{folder}' holds no data/*/*.parquet; download the data set with its data, films aside.")
-    parts = [read_columns(file, wanted) for file in files]
-    return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+    needs("pyarrow")
+    for file in files:
+        known(wanted, names_in(file))
+    return read_parquet(files, wanted)
 
 
 def _by_entry(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
-    """A column of lists by the names of its entries, counted where they have none."""
-    rows = [np.atleast_1d(entry) for entry in column]
-    lengths = {len(row) for row in rows}
-    if len(lengths) != 1:
-        raise StoreError(f"{name} holds lists of {min(lengths)} to {max(lengths)} entries; all need the same.")
-    length = lengths.pop()
+    """A column of lists by the names of its entries, counted where they have none; numbers are lists of one."""
+    rows = stacked(name, column)
+    rows = column[:, None] if rows is None else rows
+    length = rows.shape[1]
     if names is not None and len(names) != length:
         raise StoreError(f"{name} holds lists of {length}, and {INFO} names {len(names)} entries; mend one of them.")
     whose = names if names is not None else [str(k) for k in range(length)]
-    return dict(zip(whose, np.stack(rows).T))
+    return dict(zip(whose, rows.T))
 
 
 def _joined(own: Mapping[str, Columns], state: Sequence[str]) -> Columns:
@@ -162,9 +161,9 @@ def _joined(own: Mapping[str, Columns], state: Sequence[str]) -> Columns:
 
 def _arriving(reward: np.ndarray, episode: np.ndarray) -> np.ndarray:
     """(M,) of `next.reward`, which a frame's action earned, that of the frame in which it arrived."""
-    earned = np.zeros(len(reward))
+    earned = np.zeros(len(episode))
     follows = episode[1:] == episode[:-1]
-    earned[1:][follows] = np.array([np.ravel(entry)[0] for entry in reward[:-1]], np.float64)[follows]
+    earned[1:][follows] = reward[:-1][follows]
     return earned
 
 

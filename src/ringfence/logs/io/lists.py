@@ -35,7 +35,7 @@ def expanded(
 
 def _entries(name: str, column: np.ndarray, names: Sequence[str] | None) -> Columns:
     """The column itself, or those of its lists' entries."""
-    rows = _stacked(name, column)
+    rows = stacked(name, column)
     if rows is None:
         return {name: column}
     if names is not None and len(names) != rows.shape[1]:
@@ -46,7 +46,7 @@ def _entries(name: str, column: np.ndarray, names: Sequence[str] | None) -> Colu
     return {inner: rows[:, k] for k, inner in enumerate(whose)}
 
 
-def _stacked(name: str, column: np.ndarray) -> np.ndarray | None:
+def stacked(name: str, column: np.ndarray) -> np.ndarray | None:
     """(M, entries) of a column of lists, all of one length; None of any other column."""
     if column.ndim == 2:
         return column

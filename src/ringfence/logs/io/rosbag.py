@@ -173,6 +173,8 @@ def _asked_of(
             topics["joints"] = joined(prefix, joints)
         if cost is not None:
             topics["cost"] = costs[k]
+        if len(set(topics.values())) < len(topics):
+            raise UserError(f"odom, cmd, joints and cost of '{name}' name one topic twice; each needs one of its own.")
         found.append(_Asked(name, topics))
     return found
 

@@ -6,14 +6,17 @@ from north (sumo.dlr.de/docs/Simulation/Output/FCDOutput.html). Velocities follo
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import NoReturn
 from xml.parsers import expat
 
 import numpy as np
 
-from ringfence.errors import StoreError
+from ringfence.errors import StoreError, reading
 
+CHUNK = 2**20  # bytes that are parsed at a time
+LONGEST = 2**24  # bytes of a comment or an element
 KINDS = ("vehicle", "person")  # persons are read where there is no vehicle: they may ride in one
 WORDS = ("id", "type", "lane", "edge")
 MOTION = ("x", "y", "speed", "angle")  # which are numbers in every file
@@ -22,11 +25,14 @@ MOTION = ("x", "y", "speed", "angle")  # which are numbers in every file
 def read_fcd(path: Path) -> dict[str, np.ndarray]:
     """Columns (M,) `time`, `agent`, `vx`, `vy`, and every attribute that all vehicles have, numbers as float64."""
     rows = _Rows(path)
-    with path.open("rb") as file:
-        try:
-            rows.parser.ParseFile(file)
-        except expat.ExpatError as error:
-            raise StoreError(f"'{path}' is truncated or no XML ({error}); write it again.") from None
+    with path.open("rb") as file, reading(path, "XML", "write it again"):
+        for begins in itertools.count(0, CHUNK):  # expat begins anew at each piece of what it has not seen the end of
+            piece = file.read(CHUNK)
+            rows.parser.Parse(piece, not piece)
+            if begins - rows.parser.CurrentByteIndex > LONGEST:
+                raise StoreError(f"'{path}' holds {LONGEST / 2**20:.0f} MiB without an element; take them out.")
+            if not piece:
+                break
     return _columns(path, *rows.of_first_kind())
 
 
@@ -76,15 +82,19 @@ def _columns(path: Path, times: list[float], rows: list[dict[str, str]]) -> dict
             f"'{path}' has vehicles without {lacking[0]}; leave it in --fcd-output.attributes, or leave that option "
             "out."
         )
-    columns = {"time": np.array(times), "agent": np.array([row["id"] for row in rows])}
+    columns = {"time": np.array(times), "agent": _words(rows, "id")}
     for name in common:
         if name in WORDS:
-            columns[name] = np.array([row[name] for row in rows])
+            columns[name] = _words(rows, name)
         elif name not in columns:
             columns[name] = _numbers(path, name, rows)
     angle = np.deg2rad(columns["angle"])
     speed = columns["speed"]
     return columns | {"vx": speed * np.sin(angle), "vy": speed * np.cos(angle)}
+
+
+def _words(rows: list[dict[str, str]], name: str) -> np.ndarray:
+    return np.array([row[name] for row in rows], object)  # which takes no row for as long as the longest
 
 
 def _numbers(path: Path, name: str, rows: list[dict[str, str]]) -> np.ndarray:
@@ -96,7 +106,7 @@ def _numbers(path: Path, name: str, rows: list[dict[str, str]]) -> np.ndarray:
             raise StoreError(
                 f"'{path}' says {name}='{rows[0][name]:.60}', which is no number; write it again."
             ) from None
-        return np.array([row[name] for row in rows])
+        return _words(rows, name)
     return np.array([_number(path, name, row[name]) for row in rows])
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, unknown
+from ringfence.errors import StoreError, UserError, of_kind, one_of
 from ringfence.logs.io.angles import without_angles
 from ringfence.logs.io.clock import Clock, clock_of, off_the_clock, on_whole_steps
 from ringfence.logs.io.columns import (
@@ -120,6 +120,8 @@ def _read(
     share: float | None = None,
 ) -> tuple[dict[str, Any], int]:
     """What `from_steps` takes, and how many episodes are of the first `share` of the time."""
+    of_kind("card", card, Mapping | None, "give a dictionary of its fields")
+    of_kind("notes", notes, Sequence, "give a list of sentences")
     columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])
     columns, metres = in_metres(columns, schema)
     columns, schema, angles = without_angles(columns, schema)
@@ -151,9 +153,8 @@ def _read(
 def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
     """A table in a published format (`LAYOUTS`), or several, as one that `read_table` takes, and its schema; options
     are those of a `TableSchema` beside columns."""
-    if layout not in LAYOUTS:
-        raise unknown("layout", layout, LAYOUTS)
-    tables = [_of_layout(one, LAYOUTS[layout], layout, options, k) for k, one in enumerate(_each(table))]
+    known = one_of("layout", layout, LAYOUTS)
+    tables = [_of_layout(one, known, layout, options, k) for k, one in enumerate(_each(table))]
     columns, schema = _joined(tables)
     return columns, replace(schema, join=False)
 
@@ -200,7 +201,7 @@ def _joined(tables: list[tuple[Columns, TableSchema]]) -> tuple[Columns, TableSc
     episodes = []
     for k, (columns, schema) in enumerate(tables):
         own = [""] * len(columns[schema.time]) if schema.episode is None else words(columns, schema.episode)
-        episodes.append(np.array([f"{k:06d}/{name}" for name in own]))
+        episodes.append(np.array([f"{k:06d}/{name}" for name in own], object))
     columns = {name: _one_after_another(name, [columns[name] for columns, _ in tables]) for name in tables[0][0]}
     if first.join:
         return columns, first
