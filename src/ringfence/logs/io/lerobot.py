@@ -22,6 +22,7 @@ from ringfence.utils.natural import natural
 
 INFO = "meta/info.json"
 LARGEST = 2**24  # bytes of meta/info.json
+SLOWEST, FASTEST = 1e-6, 1e6  # frames a second
 SIDES = ("left", "right")  # arms, where every action begins with one of them
 STATE = "observation.state"
 ACTION = "action"
@@ -95,8 +96,8 @@ def read_info(file: Path) -> Info:
         raise StoreError(
             f"'{file}' is of version {version[:20]} of LeRobot's format; v2 and v3 can be read, so convert it."
         )
-    if not 0 < fps < np.inf:
-        raise StoreError(f"'{file}' says {fps} frames a second; it must be a number above 0.")
+    if not SLOWEST <= fps <= FASTEST:
+        raise StoreError(f"'{file}' says {fps} frames a second; it must be a number from {SLOWEST} to {FASTEST:g}.")
     return Info(fps, frames, features)
 
 
