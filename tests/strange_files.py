@@ -169,10 +169,11 @@ def bombs(folder: Path) -> Iterator[Case]:
     yield "JSON lines of 2,000 agents", from_table("wide.jsonl", wide="{agent}_{column}"), lambda _: False
     vehicle = '<vehicle id="a" x="{0}" y="1" angle="90" speed="1"/>'
     rows = "".join(f'<timestep time="{k}">{vehicle.format(k)}</timestep>' for k in range(STEPS))
+    long = rows.replace('id="a"', 'id="' + "z" * 5_000_000 + '"', 1)
     for what, text in {
         "a comment of 9 MB": f"<fcd-export><!--{'x' * 9_000_000}-->{rows}</fcd-export>",
         "an encoding that nobody knows": f"<?xml version='1.0' encoding='zz'?><fcd-export>{rows}</fcd-export>",
-        "a name of 5 MB": f"<fcd-export>{rows.replace('id=.a.', 'id=' + chr(34) + 'z' * 5_000_000, 1)}</fcd-export>",
+        "a name of 5 MB": f"<fcd-export>{long}</fcd-export>",
     }.items():
         (folder / "a.xml").write_text(text)
         yield f"SUMO with {what}", lambda: EpisodeStore.from_layout(folder / "a.xml", "sumo"), sound
