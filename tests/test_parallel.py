@@ -269,8 +269,8 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     assert results["default@validation"]["per_episode"] != results["default"]["per_episode"]
     app.main(["report", str(folder), "--out", "page.html"])
     page = html.unescape((tmp_path / "page.html").read_text())
-    command = f"play {folder} --env THEIR.py:SIMULATOR --episodes 2"
-    assert f"{command}  # THEIR.py:SIMULATOR is theirs.py:Theirs of whoever played" in page, "no line runs their code"
+    assert f"play {folder} --env THEIR.py:SIMULATOR --episodes 2" in page, "no line runs their code by being copied"
+    assert "# THEIR.py:SIMULATOR is theirs.py:Theirs of whoever played" in page
     logs = Run(folder).logs
     assert f"The data itself has a return of {np.mean(logs['returns']):.1f}" in page, "beside what it was learned from"
     assert "`ringfence eval" not in page and "ringfence eval RUN" not in page, "nobody here can play it"
