@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -240,20 +239,6 @@ def test_agents_are_told_apart_where_asked(two_drifts, tmp_path):
         denoiser = load(loop.train("madiff", two_drifts, quiet=True, **asked)[0])[1].networks["denoiser"]
         assert (denoiser.which is not None) == apart
     assert np.abs(denoiser.which).max() > 0, "it is learned"
-
-
-def test_runs_from_before_drivers_are_gone_on_with(two_drifts, tmp_path):
-    before = {"drivers": 0, "around": "nothing", "noisy_input": "unit", "guided": False}
-    before |= {"clone_width": 384, "clone_depth": 3}
-    settings = dict(out=tmp_path, changes=PLANS | before | {"num_updates": 4}, world=QUICK_WORLD, quiet=True)
-    run = loop.train("madiff", two_drifts, **settings)[0]
-    file = run.path / "config.json"
-    about = json.loads(file.read_text())
-    for name, value in (before | {"distinguish_agents": False, "error": "output"}).items():
-        assert about["config"].pop(name) == value
-    file.write_text(json.dumps(about))
-    assert loop.train("madiff", two_drifts, **settings)[0].path == run.path
-    load(run)
 
 
 class Line(eqx.Module):
