@@ -81,6 +81,8 @@ WAYS = {
     "alone": "without guidance (`madiff`)",
     "best of 8": "the best of 8",
     "best of 64": "the best of 64",
+    "best of 64, spread 1": "the best of 64, drawn no wider apart than single plans",
+    "best of 64, spread 5": "the best of 64, drawn wider still (`spread=5`)",
 }
 
 

@@ -226,7 +226,7 @@ def test_poses_without_velocities(tmp_path, kind, form):
         [[k, 3, -4, 2.5] for k in range(3)],
         rtol=1e-12,
     )
-    with pytest.raises(StoreError, match="'/a/pose' is of type 'geometry_msgs/msg/.*', and cmd is read from"):
+    with pytest.raises(UserError, match="odom, cmd, joints and cost of 'a' name one topic twice"):
         read_bag(write(tmp_path, messages, "mcap"), ["/a"], odom="pose", cmd="pose")
 
 

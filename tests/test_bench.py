@@ -657,5 +657,5 @@ def test_an_archive_writes_cells_and_nothing_else(made, tmp_path, name):
     with pytest.raises(UserError, match="which is no file of a cell"):
         rows(out)
     (out / "runs.tar.xz").write_bytes(b"no archive")
-    with pytest.raises(UserError, match="truncated or damaged"):
+    with pytest.raises(UserError, match="truncated, damaged"):
         rows(out)

@@ -157,7 +157,7 @@ def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
     (folder / "metadata.json").write_text("{}")
     with pytest.raises(SystemExit):
         main(["data", "import-ogmarl", str(folder), "--task", "ant_2x4", "--out", str(tmp_path / "x.h5")])
-    assert "[bold]/[/abs]/metadata.json' is damaged" in capsys.readouterr().err
+    assert "[bold]/[/abs]/metadata.json' is truncated, damaged" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "tensorstore", None)  # as if it were not installed
     with pytest.raises(SystemExit):
         main(["data", "import-ogmarl", str(folder), "--task", "ant_2x4", "--out", str(tmp_path / "x.h5")])

@@ -26,6 +26,7 @@ from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
 from ringfence.world.card import Avoidable, BarrierScores, Card, Verdict
+from ringfence.world.look import look_of
 from tests.quick import QUICK_WORLD
 
 
@@ -196,6 +197,7 @@ def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, optio
     something else is asked for."""
     avoidable = Avoidable(before=(1, 3, 15), avoided=tuple(avoided), rows=15)
     card = Card(data=small_world.card.data, barrier=BarrierScores(ahead_kept=kept, avoidable=avoidable))
+    card = msgspec.structs.replace(card, look=look_of(card))
     world = dataclasses.replace(small_world, card=card)
     for policy in (ringfence.guard(lambda seen, state: 0, world, **options).policy.guarded,
                    ringfence.guard(Constant(world.spec), world, **options)):  # fmt: skip

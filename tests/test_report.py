@@ -204,7 +204,8 @@ def test_commands_are_those_that_made_the_results(runs):
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
     lines = provenance.commands(section, Path("r.html"))
-    assert f"ringfence play {runs[0].path} --env yard.py:Yard --agents 5" in lines
+    played = f"ringfence play {runs[0].path} --env THEIR.py:SIMULATOR --agents 5"
+    assert any(line.startswith(played) and "yard.py:Yard of whoever played" in line for line in lines)
     assert f"ringfence eval {runs[1].path} --episodes 20" in lines
     assert sum(line.startswith("# of ") and "split+sampling_steps4" in line for line in lines) == 1
     results["split"]["command"] = ["data", "make", "x", "--out", "/etc/passwd"]
