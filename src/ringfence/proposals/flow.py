@@ -95,17 +95,20 @@ class FlowPolicy(eqx.Module):
 
         guides = None if self.world is None else jnp.repeat(self.world.map(observations, state), count, 0)
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
+        temperatures = jnp.tile(self.options.temperatures(count), batch)
 
         def act(x: Array) -> Array:
             # what is foreseen is proposed unguided
-            return self.draw(x, driver, key, guides if x is seen else None, self.options.spread if count > 1 else 1.0)
+            return self.draw(x, driver, key, guides if x is seen else None, temperatures)
 
         actions = rolled(act, self.feature_map, world, seen, present, rows)
         return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 
-    def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None, spread: float = 1.0) -> Array:
-        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,), that far apart; guided from `present`
-        (B, N, D'), the same in the World's view."""
+    def draw(
+        self, x: Array, driver: Array, key: Key, present: Array | None = None, temperature: Array | None = None
+    ) -> Array:
+        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,), from noise of `temperature` (B,), by
+        default the options' one; guided from `present` (B, N, D'), the same in the World's view."""
         o, s = self.options, self.spec
         batch = x.shape[0]
         seen = self._seen(x)
@@ -117,7 +120,8 @@ class FlowPolicy(eqx.Module):
 
             return self._guided(answer, batch)
 
-        action = o.temperature * spread * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
+        heat = o.temperature if temperature is None else temperature[:, None]
+        action = heat * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
         for k in range(o.sampling_steps):
             aim = clean(action, jnp.full(batch, k / o.sampling_steps))
             if present is not None:

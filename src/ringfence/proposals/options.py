@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
+
 from ringfence.errors import UserError
 from ringfence.proposals import diffusion
 from ringfence.utils.config import AtLeastOne, Count, NonNegative, check_bounds
@@ -19,7 +21,7 @@ class PlanOptions:
     cfg_scale: float = 1.2  # ω of classifier-free guidance; 1 switches it off
     target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %; of the largest, if raw
     temperature: NonNegative = 1.0  # scale of the first noise
-    spread: NonNegative = 1.0  # by which it is multiplied where several plans are drawn, to choose from or to refine
+    spread: NonNegative = 1.0  # by which it is multiplied for the last of several plans that are drawn together
     value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
     persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
@@ -33,6 +35,10 @@ class PlanOptions:
         check_bounds(self)
         if self.persist != 1.0 and not self.value_guidance:
             raise UserError(f"persist={self.persist} is read by nothing that was asked for; set value_guidance.")
+
+    def temperatures(self, count: int) -> np.ndarray:
+        """(count,) of plans that are drawn together, to choose from or to refine: the first is as of one alone."""
+        return (self.temperature * np.linspace(1.0, self.spread, count)).astype(np.float32)
 
 
 @runtime_checkable
@@ -49,7 +55,7 @@ WIDE = 3.0
 def plan_defaults(config) -> dict:
     """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone, a flow needs
     few steps, of a raw return nine tenths of the largest are asked for at every step, as MADIFF does, and several plans
-    around a learned mean are drawn wide apart."""
+    around a learned mean are drawn ever wider apart."""
     chosen: dict = {"target_return": 0.9} if getattr(config, "condition", "none") == "raw" else {}
     chosen |= {"spread": WIDE} if getattr(config, "around", "nothing") == "mean" else {}
     if hasattr(config, "drivers") and not hasattr(config, "diffusion_steps"):

@@ -202,7 +202,7 @@ class Planner(eqx.Module):
         if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
         judged = None if judged is None else jnp.repeat(judged, copies, 0)
-        heat = self.options.temperature * (self.options.spread if count > 1 else 1.0)
+        heat = np.tile(self.options.temperatures(count), b * (n if local else 1))
         x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, heat, driver, judged)
         if not local:
             return x.reshape(b, count, rows, n, d)
@@ -214,12 +214,12 @@ class Planner(eqx.Module):
         context: Array,
         visible: Array,
         key: Key,
-        temperature: float,
+        temperature: np.ndarray,
         driver: Array | None = None,
         judged: Array | None = None,
     ) -> Array:
-        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D), of drivers (B,), guided
-        from the present as a World sees it (B, N, D')."""
+        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D), from noise of
+        `temperature` (B,), of drivers (B,), guided from the present as a World sees it (B, N, D')."""
         o, (b, _, n, d) = self.options, context.shape
         rows = self.history + self.horizon
         mask = diffusion.known_entries(visible, self.history, rows)
@@ -245,7 +245,7 @@ class Planner(eqx.Module):
                 clean = self.normaliser.apply(self.agreed(self.normaliser.invert(clean)))
             return made.rest(clean)
 
-        how = (o.sampling_steps, o.sampler, temperature)
+        how = (o.sampling_steps, o.sampler, temperature[:, None, None, None])
         z = diffusion.sample(steered, made.inpaint, (b, rows, n, d), bar, key, *how)
         return self.agreed(self.normaliser.invert(made.plan(z)))
 
