@@ -145,7 +145,7 @@ def sample(
     key: Key,
     steps: int,
     sampler: Sampler = "ddim",
-    temperature: float | np.ndarray = 1.0,
+    temperature: float | Array = 1.0,
     eta: float = 0.0,
     remat: bool = False,
 ) -> Array:

@@ -202,7 +202,7 @@ class Planner(eqx.Module):
         if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
         judged = None if judged is None else jnp.repeat(judged, copies, 0)
-        heat = np.tile(self.options.temperatures(count), b * (n if local else 1))
+        heat = jnp.tile(self.options.temperatures(count), b * (n if local else 1))
         x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, heat, driver, judged)
         if not local:
             return x.reshape(b, count, rows, n, d)
@@ -214,7 +214,7 @@ class Planner(eqx.Module):
         context: Array,
         visible: Array,
         key: Key,
-        temperature: np.ndarray,
+        temperature: Array,
         driver: Array | None = None,
         judged: Array | None = None,
     ) -> Array:
