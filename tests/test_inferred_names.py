@@ -42,6 +42,13 @@ def test_what_agents_see_of_each_other_names_it(agents):
     assert inferred_names(x, numbers(len(true)), first) == true
 
 
+def test_many_entries_that_mean_nothing_hide_no_others():
+    x, true, first = team(episodes=10)
+    noise = np.random.default_rng(1).normal(size=(*x.shape[:2], 400))
+    found = inferred_names(np.concatenate([x, noise], -1), numbers(len(true) + 400), first)
+    assert found[: len(true)] == true
+
+
 def test_in_any_order_of_entries():
     x, true, first = team()
     order = np.random.default_rng(1).permutation(len(true))

@@ -145,6 +145,8 @@ def test_opposite_signs_and_lists_that_are_nobodys():
     x = np.take_along_axis(off, order[..., None], 2).reshape(400, 4, 6)
     assert sorted(partners.found_in(x)) == [((0, 2, 4), -1), ((1, 3, 5), -1)]
     assert partners.found_in(rng.normal(size=(400, 4, 6))) == ()
+    wide = np.concatenate([x, rng.normal(size=(*x.shape[:2], 400))], -1)
+    assert partners.found_in(wide) == partners.found_in(x)
     assert partners.found_in(x[:, :1]) == ()
 
 

@@ -8,7 +8,6 @@ moves and where a body heads for follow.
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +21,6 @@ from ringfence.problem.entries import Entries
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
-ENTRIES = 300  # that are compared, each with each
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
@@ -76,22 +74,23 @@ class Steps:
     """Some logged steps, evenly spread."""
 
     rows: np.ndarray  # (W,)
-    before: np.ndarray  # (W, N, O)
+    before: np.ndarray  # (W, N, O), the numbers of an entry side by side, as they are read
     after: np.ndarray
     deviation: np.ndarray  # (O,) the least of any agent
 
     @classmethod
     def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> Self | None:
-        """None where there are too few, or more entries than can be compared with each other."""
-        if observations.shape[2] > ENTRIES:
-            return None
+        """None where there are too few."""
         many = min(ROWS, MOST // (observations[0].size or 1))
         rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), many).astype(int))
         if first_rows is not None:
             rows = rows[~np.isin(rows + 1, first_rows)]
         if len(rows) < FEWEST:
             return None
-        before, after = (np.asarray(observations[some], np.float64) for some in (rows, rows + 1))
+        before, after = (
+            np.moveaxis(np.array(np.moveaxis(observations[some], -1, 0), np.float64, order="C"), 0, -1)
+            for some in (rows, rows + 1)
+        )
         return cls(rows, before, after, before.std(0).min(0))
 
     def varies(self, entry: int) -> bool:
@@ -103,23 +102,23 @@ class Steps:
 
     def change(self, entries: Sequence[int]) -> np.ndarray:
         """(W, N, k) of entries in a step."""
-        return (self.after - self.before)[..., list(entries)]
+        return self.after[..., list(entries)] - self.before[..., list(entries)]
 
 
 def _fields(steps: Steps) -> Iterator[_Field]:
     """What agents 0 and 1 see of each other with opposite signs, where the others do so, too."""
     x = steps.before
-    _, agents, width = x.shape
-    for first in range(width):
-        if not steps.varies(first) or not steps.equal(x[:, 0, first], -x[:, 1, first], first):
-            continue
+    agents = x.shape[1]
+    apart = np.abs(x[:, 0] + x[:, 1]) <= EXACT * steps.deviation
+    for first in np.flatnonzero((steps.deviation > 0) & (apart.mean(0) >= SHARE)).tolist():
         if any(np.array_equal(x[..., first], x[..., earlier]) for earlier in range(first)):
             continue
         # agent 0 sees agent k + 1 in its k-th place, and is seen by it in the first
         entries = [first]
         for k in range(1, agents - 1):
-            mirrored = -x[:, k + 1, first]
-            entries += [e for e in range(width) if e not in entries and steps.equal(x[:, 0, e], mirrored, first)][:1]
+            near = np.abs(x[:, 0] + x[:, k + 1, [first]]) <= EXACT * steps.deviation[first]
+            mirrored = np.flatnonzero(near.mean(0) >= SHARE).tolist()
+            entries += [e for e in mirrored if e not in entries][:1]
         if len(entries) == agents - 1 and _mirrored(steps, entries):
             yield _Field(tuple(entries))
 
@@ -216,8 +215,8 @@ def _off(steps: Steps, change: np.ndarray, speeds: Sequence[int], where: np.ndar
         return 1.0
     least = np.quantile(np.abs(change), SHARE)
     found = [1.0]
-    for rows in (steps.after, steps.before, 0.5 * (steps.after + steps.before)):
-        speed = rows[..., list(speeds)][... if where is None else where].ravel()
+    after, before = (rows[..., list(speeds)][... if where is None else where] for rows in (steps.after, steps.before))
+    for speed in (after.ravel(), before.ravel(), 0.5 * (after + before).ravel()):
         moves = np.abs(speed) > np.median(np.abs(speed))
         if least > 0 and moves.any() and (dt := float(np.median(change[moves] / speed[moves]))) > 0:
             found.append(float(np.quantile(np.abs(change - dt * speed), SHARE) / least))
@@ -266,7 +265,7 @@ def _direction(steps: Steps, rows: np.ndarray, velocity: np.ndarray, found: Mapp
         return bool((ahead[moves] >= (1 - LIKE) * speed[moves]).mean() >= SHARE)
 
     free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
-    for cos, sin in itertools.permutations(free, 2):
+    for cos, sin in _of_unit_length(rows, free):
         direction = rows[..., [cos, sin]].reshape(-1, 2)
         unit = np.abs(np.linalg.norm(direction, axis=-1) - 1.0) <= EXACT
         if unit.mean() >= SHARE and along(direction):
@@ -276,6 +275,17 @@ def _direction(steps: Steps, rows: np.ndarray, velocity: np.ndarray, found: Mapp
         if along(np.stack([np.cos(angle), np.sin(angle)], -1)):
             return {entry: "own.heading"}
     return {}
+
+
+def _of_unit_length(rows: np.ndarray, entries: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Two of the entries of `rows` (W, N, O), in any order, that may be a direction: so in most of a few numbers."""
+    if not entries:
+        return
+    some = np.random.default_rng(0).choice(rows.shape[0] * rows.shape[1], FEWEST)
+    squares = rows[..., list(entries)].reshape(-1, len(entries))[some].T ** 2
+    for one, cos in enumerate(entries):
+        unit = np.abs(np.sqrt(squares[one] + squares) - 1.0) <= EXACT
+        yield from ((cos, entries[two]) for two in np.flatnonzero(unit.mean(1) >= SHARE / 2) if two != one)
 
 
 def _speed_ahead(steps: Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:

@@ -18,8 +18,7 @@ from ringfence.types import Array
 
 VERSION = 1  # of what is found
 ROWS = 500  # that are compared
-ENTRIES = 300  # that are compared, each with each
-MOST = 200_000_000  # numbers that are; of wide logs fewer rows
+MOST = 4_000_000  # numbers that are compared, and equal ones that are found; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 REPEATED = 3  # times that a number may occur: places in a list that nobody has are filled with one number
 OFTEN = 0.5  # of what is seen that somebody else sees, too: who is near another need not be on the other's list
@@ -41,13 +40,14 @@ class Mirrored(NamedTuple):
 def found_in(x: np.ndarray) -> tuple[Mirrored, ...]:
     """What agents see of each other among the entries of features (W, N, D); of as many places each."""
     _, agents, width = x.shape
-    rows = min(ROWS, MOST // max(1, (agents * width) ** 2))
-    if agents < 2 or rows < 1 or width > ENTRIES:
+    rows = min(ROWS, MOST // max(1, agents * width))
+    if agents < 2 or rows < 1:
         return ()
     x = np.asarray(x[np.unique(np.linspace(0, len(x) - 1, rows).astype(int))], np.float64)
-    told = [e for e in range(width) if x[..., e].std() > 0]
-    rare = {e: _rare(x[..., e]) for e in told}
-    found = [part for sign in (-1, 1) for part in _of_sign(x, [e for e in told if rare[e].any()], rare, sign)]
+    told = np.flatnonzero(x.std((0, 1)) > 0)
+    x = x[..., told]
+    rare = np.stack([_rare(column) for column in np.moveaxis(x, -1, 0)], -1) if len(told) else np.zeros(x.shape, bool)
+    found = [Mirrored(tuple(told[list(part)].tolist()), sign) for sign in (-1, 1) for part in _of_sign(x, rare, sign)]
     if not found:
         return ()
     sizes = [len(part.entries) for part in found]
@@ -61,32 +61,61 @@ def _rare(column: np.ndarray) -> np.ndarray:
     return (counts <= REPEATED)[index].reshape(column.shape)
 
 
-def _of_sign(x: np.ndarray, told: list[int], rare: dict[int, np.ndarray], sign: int) -> list[Mirrored]:
-    others = ~np.eye(x.shape[1], dtype=bool)[..., None]
-    theirs = sign * x[:, None, :, told]  # (W, 1, N, F)
+def _of_sign(x: np.ndarray, rare: np.ndarray, sign: int) -> list[list[int]]:
+    """Groups of entries of x (W, N, F) by which two see the same of each other, up to the sign; `rare` (W, N, F) tells
+    which numbers count."""
+    entries = x.shape[-1]
+    looked_at, row, i, e, f = _equal(x, rare, sign)
+    asked = rare[looked_at].sum((0, 1))  # of each entry
+    seen = np.unique(((row * x.shape[1] + i) * entries + e) * entries + f)  # by i of anybody
+    pairs, times = np.unique(seen % entries**2, return_counts=True)
+    _, by_all = np.unique(e * entries + f, return_counts=True)  # in the same order
+    often = times >= SOME * asked[pairs // entries]
+    pairs, many = pairs[often], (by_all / times)[often]
+    told = np.unique(seen[np.isin(seen % entries**2, pairs)] // entries)  # (row, agent, entry)
+    shared = np.bincount(told % entries, minlength=entries)
     linked: dict[int, set[int]] = {}
-    for e in told:
-        same = np.abs(x[:, :, None, e, None] - theirs) <= EXACT * x[..., e].std()
-        same &= rare[e][:, :, None, None] & others
-        by_any = same.any(2)  # (W, N, F)
-        links = np.flatnonzero(by_any.sum((0, 1)) >= SOME * rare[e].sum())
-        if not len(links) or by_any[..., links].any(-1).sum() < OFTEN * rare[e].sum():
-            continue
-        many = same.sum((0, 1, 2))[links] / by_any.sum((0, 1))[links]
-        if many.max() <= ALONE:
-            linked[e] = {told[f] for f in links}
-    for e, links in list(linked.items()):
-        for f in links & set(linked):
-            linked[f].add(e)
-    parts = []
+    for one in np.flatnonzero((asked > 0) & (shared >= OFTEN * asked)):
+        of_one = pairs // entries == one
+        if of_one.any() and many[of_one].max() <= ALONE:
+            linked[int(one)] = set((pairs[of_one] % entries).tolist())
+    for one, links in list(linked.items()):
+        for other in links & set(linked):
+            linked[other].add(one)
+    groups = []
     while linked:
-        part, new = set(), {next(iter(linked))}
+        group, new = set(), {next(iter(linked))}
         while new:
-            part |= new
-            new = {f for e in new for f in linked[e] if f in linked} - part
-        parts.append(Mirrored(tuple(sorted(part)), sign))
-        linked = {e: links for e, links in linked.items() if e not in part}
-    return parts
+            group |= new
+            new = {other for one in new for other in linked[one] if other in linked} - group
+        groups.append(sorted(group))
+        linked = {one: links for one, links in linked.items() if one not in group}
+    return groups
+
+
+def _equal(x: np.ndarray, rare: np.ndarray, sign: int) -> list[np.ndarray]:
+    """The rows of x (W, N, F) that are looked at, and of P numbers in them that two agents share up to the sign the row,
+    agent, entry and the other's entry (P,). It ends early where too many are shared."""
+    near = EXACT * x.std((0, 1))
+    found = []
+    left = MOST
+    rows = np.random.default_rng(0).permutation(len(x))  # a part of them is evenly spread, too
+    for row in rows:
+        agent, entry = np.nonzero(rare[row])
+        theirs = sign * x[row].ravel()
+        order = theirs.argsort()
+        mine = x[row, agent, entry]
+        first = np.searchsorted(theirs, mine - near[entry], "left", order)
+        many = np.searchsorted(theirs, mine + near[entry], "right", order) - first
+        left -= many.sum()
+        if left < 0 and found:
+            break
+        which = np.repeat(np.arange(len(mine)), many)
+        place = np.arange(many.sum()) - np.repeat(many.cumsum() - many, many)
+        other, its = np.divmod(order[first[which] + place], x.shape[2])
+        apart = other != agent[which]
+        found.append([np.full(apart.sum(), row), agent[which][apart], entry[which][apart], its[apart]])
+    return [rows[: len(found)], *(np.concatenate(part) for part in zip(*found))]
 
 
 def places(mirrored: Sequence[Mirrored]) -> int:
