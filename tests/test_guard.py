@@ -63,33 +63,37 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, boun
     assert found["hard"].short.any()  # what cannot be met is said
 
 
+def missing(guard, present, plan, margin):
+    """(B, K, N) of the condition along plans."""
+    rows, spread = guard.predict(present, plan[:, None])
+    return guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin)
+
+
+@eqx.filter_jit
+def shielded(guard, present, plan, margin):
+    return guard.shielded(present, plan, missing(guard, present, plan, margin), margin)
+
+
 def test_the_shield_never_makes_it_worse(small_world, bound, present):
     guard = make(small_world, bound, correction_steps=3)
     plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-1, maxval=1)
     margin = jnp.full((64, 1), 3.0)
-
-    @jax.jit
-    def missing(plan):
-        rows, spread = guard.predict(present, plan[:, None])
-        return guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin).sum((1, 2))
-
-    assert (missing(eqx.filter_jit(guard.shielded)(present, plan, margin)) >= missing(plan) - 1e-5).all()
+    before, after = (missing(guard, present, p, margin) for p in (plan, shielded(guard, present, plan, margin)))
+    assert (after.sum((1, 2)) >= before.sum((1, 2)) - 1e-5).all()
 
 
 def test_a_correction_that_falls_short_is_begun_again(small_world, bound, present):
     """No plan becomes worse, some become better, and none leaves its bounds."""
     plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-0.3, maxval=0.3)
     margin = jnp.full((64, 1), 3.0)
-    missing = {}
+    left = {}
     for restarts in (0, 1):
         guard = make(small_world, bound, correction_steps=3, correction_restarts=restarts, max_correction=0.8)
-        found = eqx.filter_jit(guard.shielded)(present, plan, margin)
+        found = shielded(guard, present, plan, margin)
         assert (jnp.abs(found - plan) <= 0.8 + 1e-6).all() and (jnp.abs(found) <= 1).all()
-        rows, spread = guard.predict(present, found[:, None])
-        clear = guard.clear(rows, spread, margin)[:, 0]
-        missing[restarts] = np.asarray(guard.missing(present, clear, margin).sum((1, 2)))
-    assert (missing[1] >= missing[0] - 1e-5).all()
-    assert (missing[1] > missing[0] + 1e-2).any()
+        left[restarts] = np.asarray(missing(guard, present, found, margin).sum((1, 2)))
+    assert (left[1] >= left[0] - 1e-5).all()
+    assert (left[1] > left[0] + 1e-2).any()
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 6])
@@ -118,7 +122,7 @@ def test_what_was_asked_for_is_held_for_a_few_rows_and_not_for_all(speed, kept):
 
     correct = Corrector(missing, within, alone=False, steps=10, restarts=1)
     asked = jnp.ones((1, 15, 2, 1))
-    found = correct(jnp.full((1, 1, 1, 1), speed), asked, jnp.ones((1, 1)))
+    found = correct(jnp.full((1, 1, 1, 1), speed), asked, missing(speed, asked[:, None], None)[:, 0], jnp.ones((1, 1)))
     assert (missing(speed, found[:, None], None) >= -1e-3).all()
     assert ((found[:, :ASKED] == 1.0).all()) == kept
     plans = continuations(rows=12, agents=2, dim=2)
@@ -137,7 +141,8 @@ def test_what_is_near_counts_for_more_where_no_plan_meets_all():
         return -jnp.ones_like(plan), jnp.ones_like(plan)
 
     correct = Corrector(missing, within, alone=False, steps=10, restarts=1)
-    found = correct(jnp.zeros(1), jnp.ones((1, 15, 1, 1)), jnp.ones((1, 1)))
+    asked = jnp.ones((1, 15, 1, 1))
+    found = correct(jnp.zeros(1), asked, missing(None, asked[:, None], None)[:, 0], jnp.ones((1, 1)))
     assert found[0, 0, 0, 0] <= 0
 
 
@@ -146,9 +151,8 @@ def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
     guard = make(small_world, bound, correction_steps=4)
     plan = jax.random.uniform(jax.random.key(6), (45, 3, 3, 2), minval=-1, maxval=1)
     margin = jnp.linspace(-1.0, 3.0, 45)[:, None]
-    several = eqx.filter_jit(guard.shielded)(present[:45], plan, margin)
-    few = eqx.filter_jit(guard.shielded)
-    each = [few(present[k : k + 9], plan[k : k + 9], margin[k : k + 9]) for k in range(0, 45, 9)]
+    several = shielded(guard, present[:45], plan, margin)
+    each = [shielded(guard, present[k : k + 9], plan[k : k + 9], margin[k : k + 9]) for k in range(0, 45, 9)]
     np.testing.assert_allclose(several, jnp.concatenate(each), atol=1e-4)
     moved = (several != plan).any((1, 2, 3))
     assert 0 < moved.sum() < 45
@@ -228,10 +232,11 @@ def test_the_shield_stays_within_its_bound(small_world, bound, present):
         BarrierSource(small_world, "analytic", bound, False), GuardOptions(correction_steps=10, max_correction=0.1)
     )
     plan = jnp.full((64, 3, 3, 2), 0.95)
-    kept = eqx.filter_jit(guard.shielded)(present, plan, jnp.full((64, 1), 9.0))
+    margin = jnp.full((64, 1), 9.0)
+    kept = shielded(guard, present, plan, margin)
     moved = jnp.abs(kept - plan)
     assert 0.05 < moved.max() <= 0.1 + 1e-6 and jnp.abs(kept).max() <= 1
-    far = make(small_world, bound, correction_steps=10).shielded(present, plan, jnp.full((64, 1), 9.0))
+    far = shielded(make(small_world, bound, correction_steps=10), present, plan, margin)
     assert jnp.abs(far - plan).max() > 0.2
 
 

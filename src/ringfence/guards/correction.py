@@ -56,9 +56,9 @@ class Corrector:
     steps: int
     restarts: int
 
-    def __call__(self, present: PyTree, plan: Array, margin: Array) -> Array:
-        """Where nothing is missing a plan is kept as it is."""
-        asked = begun = Found(plan, self.missing(present, plan[:, None], margin)[:, 0])
+    def __call__(self, present: PyTree, plan: Array, missed: Array, margin: Array) -> Array:
+        """Where nothing is missing a plan is kept as it is. `missed` (B, K, N) along it."""
+        asked = begun = Found(plan, _weighed(missed))
         if plan.shape[1] > ASKED and self.steps:
             begun = self._where_short(self._continued, AGAIN, 0.0, (present, plan, asked, margin))
         found = self._where_short(self._by_slope, TOGETHER, 0.0, (present, plan, begun, margin))
@@ -90,13 +90,8 @@ class Corrector:
         return (self._shortfall(found.missing) < -bearable).any(1)
 
     def missing(self, present: PyTree, plans: Array, margin: Array) -> Array:
-        """(B, S, K, N) what is missing along plans (B, S, K, N, A), more of it in the rows that were asked for: the
-        next decisions may mend what is far ahead."""
-        rows = plans.shape[2]
-        missed = self.missed(present, plans, margin)
-        if rows <= ASKED:
-            return missed
-        return missed * np.where(np.arange(rows) < ASKED, NEAR, 1.0)[:, None]
+        """(B, S, K, N) what is missing along plans (B, S, K, N, A), as it is weighed."""
+        return _weighed(self.missed(present, plans, margin))
 
     def _shortfall(self, missing: Array) -> Array:
         """(B, 1) of a team, or (B, N) of agents who are alone: what is `missing` (B, K, N), in all."""
@@ -194,6 +189,13 @@ class Corrector:
         fine = short >= short.max(1, keepdims=True) - TOLERANCE
         best = jnp.where(fine, -far, -jnp.inf).argmax(1)
         return Found(_picked(starts, best), _picked(missing[..., None], best)[..., 0])
+
+
+def _weighed(missed: Array) -> Array:
+    """What is missing (..., K, N), more of it in the rows that were asked for: the next decisions may mend what is far
+    ahead."""
+    rows = missed.shape[-2]
+    return missed if rows <= ASKED else missed * np.where(np.arange(rows) < ASKED, NEAR, 1.0)[:, None]
 
 
 def _picked(plans: Array, index: Array) -> Array:

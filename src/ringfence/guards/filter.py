@@ -79,14 +79,23 @@ class Guard(eqx.Module):
         others what is proposed stays as it is."""
         proposals = self.held(self.world.spec.own(proposals))
         if self.options.optimizer_steps:
-            proposals = self.refined(present, *self.started(proposals, last, key, driven), margin)
-        rows, spread = self.predict(present, proposals)
-        chosen = self.selected(rows, proposals, self.clear(rows, spread, margin, unseen))
-        index = jnp.expand_dims(chosen, (1, 2, 4) if self.world.alone else (1, 2, 3, 4))
-        plan = jnp.take_along_axis(proposals, index, 1)[:, 0]
+            proposals = self.held(self.refined(present, *self.started(proposals, last, key, driven), margin))
+        rows, spreads = self.predict(present, proposals)
+        clear = self.clear(rows, spreads, margin, unseen)
+        chosen = self.selected(rows, proposals, clear)
+        asked = self._picked(proposals, chosen)
+        if self.world.alone and proposals.shape[1] > 1:  # what each agent chose for itself was not predicted together
+            ahead, spread = self.predict(present, asked)
+            clear = self.clear(ahead, spread, margin, unseen)
+        else:
+            ahead, spread, clear = (self._picked(x, chosen) for x in (rows, spreads, clear))
+        plan = asked[:, 0]
         if self.options.correction_steps:
-            plan = self.shielded(present, plan, margin, unseen, driven)
-        ahead, spread = self.predict(present, plan[:, None])
+            plan = self.shielded(present, plan, self.missing(present, clear[:, 0], margin), margin, unseen, driven)
+            # Most plans stay as they were asked for, and where these lead is known.
+            changed = (plan != asked[:, 0]).any()
+            known = ahead, spread
+            ahead, spread = jax.lax.cond(changed, lambda: self.predict(present, plan[:, None]), lambda: known)
         seen = self.nearer(ahead, unseen)
         scores = self.barrier.along(seen, spread)[:, 0]
         missing = self.missing(present, self.clear(ahead, spread, margin, unseen)[:, 0], margin)
@@ -227,16 +236,24 @@ class Guard(eqx.Module):
         clear = clear.min(2)
         return pick(clear if self.world.alone else clear.min(-1), value, 0.0)
 
+    def _picked(self, x: Array, chosen: Array) -> Array:
+        """(B, 1, K, N, ...) of numbers along proposals (B, P, K, N, ...), those of the one that was chosen (B,), or (B,
+        N) by each agent."""
+        agents = 3 if self.world.alone else None
+        index = jnp.expand_dims(chosen, [axis for axis in range(1, x.ndim) if axis != agents])
+        return jnp.take_along_axis(x, index, 1)
+
     def shielded(
         self,
         present: Array,
         plan: Array,
+        missed: Array,
         margin: Array,
         unseen: Array | None = None,
         driven: Array | None = None,
     ) -> Array:
         """Plans (B, K, N, A) corrected until the condition holds along the predicted rows, and the best found
-        otherwise, within `max_correction` of what they were."""
+        otherwise, within `max_correction` of what they were. `missed` (B, K, N) of it along them."""
         options = self.options
 
         def missing(given: Given, plans: Array, margin: Array) -> Array:
@@ -246,7 +263,7 @@ class Guard(eqx.Module):
             return self._within(plan, options.max_correction, given[2])
 
         correct = Corrector(missing, within, self.world.alone, options.correction_steps, options.correction_restarts)
-        return self.held(correct((present, unseen, driven), plan, margin))
+        return self.held(correct((present, unseen, driven), plan, missed, margin))
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
         """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has

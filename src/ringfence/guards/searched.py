@@ -61,10 +61,13 @@ def _searched(guard: Guard, present: Array, wanted: Array) -> tuple[Array, Array
     shape = (len(present), present.shape[1], limits) if guard.world.alone else (len(present), limits)
     margin = jnp.full(shape, guard.options.margin)
     plan = held(guard.world.spec.own(wanted), guard.options.horizon)[:, 0]
-    plan = guard.shielded(present, plan, margin)
-    rows, spread = guard.predict(present, plan[:, None])
-    missing = guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin)
-    return rows[:, 0, 1:], (missing >= -TOLERANCE).all((1, 2))
+
+    def followed(plan: Array) -> tuple[Array, Array]:
+        rows, spread = guard.predict(present, plan[:, None])
+        return rows[:, 0, 1:], guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin)
+
+    rows, missing = followed(guard.shielded(present, plan, followed(plan)[1], margin))
+    return rows, (missing >= -TOLERANCE).all((1, 2))
 
 
 def _known(logged: Logged) -> list[Cells]:
