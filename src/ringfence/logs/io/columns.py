@@ -6,7 +6,7 @@ import importlib
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
 from numbers import Number
@@ -17,10 +17,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, reading, reason, unknown
-from ringfence.logs.io.jsonlines import read_json_lines
-from ringfence.logs.io.obsmat import read_obsmat
-from ringfence.logs.io.parquet import as_numpy, names_in, read_parquet
-from ringfence.logs.io.sumo import read_fcd
+from ringfence.logs.io.formats import as_numpy, names_in, read_fcd, read_json_lines, read_obsmat, read_parquet
 
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
 Tables = Table | list[Table] | tuple[Table, ...]  # one, or several recordings
@@ -29,6 +26,7 @@ READERS: dict[str, Callable[[Path], Columns]] = {".xml": read_fcd, ".txt": read_
 LINES = (".jsonl", ".ndjson")
 PARQUET = (".parquet", ".pq")
 KINDS = (".csv", *PARQUET, *LINES, *READERS)
+LONGEST = 1000  # entries of a list
 
 
 @dataclass(frozen=True)
@@ -311,3 +309,39 @@ def _is_number(entry: Any) -> bool:
     except (OverflowError, TypeError, ValueError):
         return False
     return True
+
+
+# --- lists ---
+def stacked(name: str, column: np.ndarray) -> np.ndarray | None:
+    """(M, entries) of a column of lists, all of one length; None of any other column."""
+    if column.ndim == 2:
+        return column
+    if column.dtype.kind != "O" or not any(_is_list(entry) for entry in column):
+        return None
+    length = next(len(entry) for entry in column if _is_list(entry))
+    for row, entry in enumerate(column):
+        if not _is_list(entry) or len(entry) != length or any(_is_list(inner) for inner in entry):
+            raise StoreError(
+                f"row {row}: {name} is no list of {length} numbers as in the rows before; drop the row, or mend it."
+            )
+    if not 0 < length <= LONGEST:
+        raise UserError(f"{name} holds lists of {length} entries, from 1 to {LONGEST} can be read; leave it out.")
+    rows = np.array([list(entry) for entry in column], object)
+    try:
+        return rows.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return rows  # whoever reads its numbers refuses the first that is none, by its row
+
+
+def by_entry(name: str, rows: np.ndarray, names: Sequence[str] | None) -> Columns:
+    """Columns (M,) of lists (M, entries) by the names of their entries, counted where they have none."""
+    length = rows.shape[1]
+    if names is not None and len(names) != length:
+        raise StoreError(
+            f"{name} holds lists of {length}, and meta/info.json names {len(names)} entries; mend one of them."
+        )
+    return dict(zip(names if names is not None else map(str, range(length)), rows.T))
+
+
+def _is_list(entry: object) -> bool:
+    return isinstance(entry, list | tuple) or (isinstance(entry, np.ndarray) and entry.ndim == 1)

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, reading, unknown
-from ringfence.logs.io.columns import Columns, Table, known, needs, numbers
-from ringfence.logs.io.lists import stacked
-from ringfence.logs.io.parquet import names_in, read_parquet
+from ringfence.logs.io.columns import Columns, Table, by_entry, known, needs, numbers, stacked
+from ringfence.logs.io.formats import names_in, read_parquet
 from ringfence.utils.natural import natural
 
 INFO = "meta/info.json"
@@ -54,8 +53,8 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
             raise unknown("column of the data set", name, info.names)
     reward = [REWARD] if REWARD in info.names else []
     read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward])
-    single = {name: next(iter(_by_entry(name, read[name], None).values())) for name in read if name not in wanted}
-    own = {name: _by_entry(name, read[name], info.names[name]) for name in wanted}
+    single = {name: next(iter(_entries(name, read[name], None).values())) for name in read if name not in wanted}
+    own = {name: _entries(name, read[name], info.names[name]) for name in wanted}
     states = _joined(own, state)
     actions = own[ACTION]
     agents = _agents(arms, list(actions))
@@ -140,15 +139,10 @@ def _read_files(folder: Path, wanted: list[str]) -> Columns:
     return read_parquet(files, wanted)
 
 
-def _by_entry(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
-    """A column of lists by the names of its entries, counted where they have none; numbers are lists of one."""
+def _entries(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
+    """A column of lists by the names of its entries; numbers are lists of one."""
     rows = stacked(name, column)
-    rows = column[:, None] if rows is None else rows
-    length = rows.shape[1]
-    if names is not None and len(names) != length:
-        raise StoreError(f"{name} holds lists of {length}, and {INFO} names {len(names)} entries; mend one of them.")
-    whose = names if names is not None else [str(k) for k in range(length)]
-    return dict(zip(whose, rows.T))
+    return by_entry(name, column[:, None] if rows is None else rows, names)
 
 
 def _joined(own: Mapping[str, Columns], state: Sequence[str]) -> Columns:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError
-from ringfence.logs.io.angles import angle_of
 from ringfence.logs.io.table_schema import AXES
 from ringfence.logs.io.tracks import Tracks, nearest
+from ringfence.logs.io.units import angle_of
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import Entries, Entry
 from ringfence.problem.others import others
