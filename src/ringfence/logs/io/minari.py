@@ -20,8 +20,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ringfence.datasets.importers import columns, common
 from ringfence.errors import StoreError, reading, reason
+from ringfence.logs.io import common
 from ringfence.problem.bounds import Bounds
 from ringfence.utils import arrays, schemas
 
@@ -52,9 +52,9 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     _check_alike(path, found, episodes[0])
     seen, acted = _widths(path, first)
     if asked.agents is not None:
-        columns.check(path, asked.agents, seen, acted)
+        common.check_agents(path, asked.agents, seen, acted)
     bounds = common.bounds_of(_action_space(path, metadata, asked, acted), asked, acted)
-    arrays.affordable(path, sum(shapes.size for shapes in found.values()), common.PACKED)
+    arrays.affordable(path, sum(shapes.size for shapes in found.values()))
 
     found = _with_steps(path, found, notes)
     ends = np.cumsum([shapes.steps for shapes in found.values()], dtype=np.int64)
