@@ -8,11 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from ringfence.errors import StoreError
-from ringfence.logs.io.table_schema import AXES, TableSchema
+from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Tracks, cut, nearest, teams
+from ringfence.problem.entries import SPACE
 from ringfence.problem.others import others
 
-RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in AXES)
+RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,9 +88,9 @@ def read_bag(
         raise UserError(f"twist='{twist}' is unknown; choose child (the robot's frame, ROS's rule) or world.")
     with opened(path) as bag:
         asked = _asked_of(bag, _prefixes(bag, agents, odom), odom, cmd, joints, cost)
-        topics = bag.read({one.topics[role]: role for role in ROLES for one in asked if role in one.topics})
+        topics = bag.read({own[role]: role for role in ROLES for _, own in asked if role in own})
         start = bag.start(topics)
-    robots = [_Robot.of(one, topics) for one in asked]
+    robots = [_Robot(name, **{role: topics[topic] for role, topic in own.items()}) for name, own in asked]
     notes: list[str] = []
     clock = _clock_of(path, robots, topics, start, stamps, notes)
     return _table(path, robots, clock, twist, notes)
@@ -127,35 +127,22 @@ def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: li
 
 
 # --- agents ---
-@dataclass(frozen=True)
-class _Asked:
-    """An agent's name, and its topics' names by role."""
-
-    name: str
-    topics: dict[str, str]
-
-
 @dataclass(frozen=True, eq=False)
 class _Robot:
     """An agent and its messages."""
 
     name: str
     odom: Topic
-    cmd: Topic | None
-    joints: Topic | None
-    cost: Topic | None
-
-    @classmethod
-    def of(cls, asked: _Asked, topics: dict[str, Topic]) -> _Robot:
-        own = {role: topics[name] for role, name in asked.topics.items()}
-        return cls(asked.name, own["odom"], own.get("cmd"), own.get("joints"), own.get("cost"))
+    cmd: Topic | None = None
+    joints: Topic | None = None
+    cost: Topic | None = None
 
 
 def _asked_of(
     bag: BagFile, prefixes: list[str], odom: str, cmd: str | None, joints: str | None, cost: str | None
-) -> list[_Asked]:
-    """What is to be read of every agent; one with poses and without commands, which others have, is refused by its
-    name."""
+) -> list[tuple[str, dict[str, str]]]:
+    """Every agent's name, and its topics by role; one with poses and without commands, which others have, is refused by
+    its name."""
     if cmd is None and any(joined(prefix, CMD) in bag.topics for prefix in prefixes):
         cmd = CMD
     costs = [] if cost is None else _cost_topics(bag, prefixes, cost)
@@ -175,7 +162,7 @@ def _asked_of(
             topics["cost"] = costs[k]
         if len(set(topics.values())) < len(topics):
             raise UserError(f"odom, cmd, joints and cost of '{name}' name one topic twice; each needs one of its own.")
-        found.append(_Asked(name, topics))
+        found.append((name, topics))
     return found
 
 
