@@ -12,7 +12,7 @@ from ringfence.envs.base import Env, NativeEnv
 from ringfence.envs.crossing import Body
 from ringfence.envs.mujoco import COST_LIMIT, Parts
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
-from ringfence.errors import StoreError, UserError, unknown
+from ringfence.errors import StoreError, UserError, one_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 
@@ -198,9 +198,7 @@ TASKS = {
 
 def get(name: str) -> Task:
     """The task of that name; an unknown one is refused with the nearest name."""
-    if name not in TASKS:
-        raise unknown("task", name, TASKS)
-    return TASKS[name]
+    return one_of("task", name, TASKS)
 
 
 def of_team(task: Task, agents: int) -> Task:

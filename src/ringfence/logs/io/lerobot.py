@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, reading, unknown
+from ringfence.errors import StoreError, UserError, one_of, reading
 from ringfence.logs.io.columns import Columns, Table, by_entry, known, needs, numbers, stacked
 from ringfence.logs.io.formats import names_in, read_parquet
+from ringfence.utils import schemas
 from ringfence.utils.natural import natural
 
 INFO = "meta/info.json"
@@ -49,8 +50,7 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     info = read_info(folder / INFO)
     wanted = [*state, ACTION]
     for name in wanted:
-        if name not in info.names:
-            raise unknown("column of the data set", name, info.names)
+        one_of("column of the data set", name, info.names)
     reward = [REWARD] if REWARD in info.names else []
     read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward])
     single = {name: next(iter(_entries(name, read[name], None).values())) for name in read if name not in wanted}
@@ -84,9 +84,7 @@ def read_info(file: Path) -> Info:
     if not file.is_file():
         raise StoreError(f"'{file.parent.parent}' holds no {INFO}, so it is no LeRobot data set; give its folder.")
     with reading(file, "info.json that LeRobot writes"):
-        if file.stat().st_size > LARGEST:
-            raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
-        info = json.loads(file.read_bytes())
+        info = json.loads(schemas.content(file, LARGEST))
         version = str(info["codebase_version"])
         fps = float(info["fps"])
         features = {str(name): _feature_names(feature) for name, feature in info["features"].items()}

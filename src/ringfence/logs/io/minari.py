@@ -240,9 +240,7 @@ def _metadata(path: Path, f: h5py.File) -> dict:
         keys = ("total_episodes", "dataset_id", "env_spec", "action_space")
         return {k: v.decode() if isinstance(v := f.attrs[k], bytes) else v for k in keys if k in f.attrs}
     with reading(file, "metadata of Minari's", "copy it again, or read the HDF5 file without it"):
-        if file.stat().st_size > schemas.LARGEST:
-            raise ValueError(f"it is larger than {schemas.LARGEST / 2**20:.0f} MiB")
-        metadata = json.loads(file.read_bytes())
+        metadata = json.loads(schemas.content(file))
         if not isinstance(metadata, dict):
             raise ValueError("it is no object")
     return metadata

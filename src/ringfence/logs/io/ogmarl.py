@@ -180,12 +180,8 @@ def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
 
 def _steps(log: StateLog | ObservationLog, env: SafeMuJoCo, provenance: str, notes: list[str]) -> dict[str, Any]:
     """What `EpisodeStore.from_steps` takes."""
-    arrays: dict[str, np.ndarray | None] = {"actions": log.actions, "rewards": log.rewards}
-    if isinstance(log, StateLog):
-        arrays = {"state": log.state, "contact": log.contact} | arrays
-    else:
-        arrays = {"observations": log.observations} | arrays
-    _check_finite(log.where, arrays)
+    arrays = ("state", "contact", "observations", "actions", "rewards")
+    _check_finite(log.where, {name: getattr(log, name, None) for name in arrays})
     ends = _ends(log, env, notes)
     made = (
         _from_states(log, env, ends, notes) if isinstance(log, StateLog) else _from_observations(log, env, ends, notes)

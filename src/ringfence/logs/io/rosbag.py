@@ -92,26 +92,15 @@ def read_bag(
         start = bag.start(topics)
     robots = [_Robot(name, **{role: topics[topic] for role, topic in own.items()}) for name, own in asked]
     notes: list[str] = []
-    clock = _clock_of(path, robots, topics, start, stamps, notes)
+    clock = _clock(path, robots, topics, start, stamps, notes)
     return _table(path, robots, clock, twist, notes)
-
-
-def _clock_of(
-    path: Path, robots: list[_Robot], topics: dict[str, Topic], start: int, stamps: bool, notes: list[str]
-) -> Clock:
-    """The clock of all robots' rows, who must agree on frames and kinds of poses."""
-    odometry = [robot.odom for robot in robots]
-    poses = {topic.name for topic in odometry}
-    others = [topic for name, topic in topics.items() if name not in poses]
-    clock = _clock(path, odometry, others, start, stamps, notes)
-    _frames(odometry, notes)
-    _refuse_two_kinds(path, odometry)
-    _refuse_two_commands(path, robots)
-    return clock
 
 
 def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: list[str]) -> Bag:
     """All robots' rows, one robot after another, and which columns are natural as state and action."""
+    _frames([robot.odom for robot in robots], notes)
+    _refuse_two_kinds(path, [robot.odom for robot in robots])
+    _refuse_two_commands(path, robots)
     parts = [_columns_of(path, robot, clock, twist, notes) for robot in robots]
     _refuse_other_joints(path, robots, parts)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in ("time", *parts[0])}
@@ -212,9 +201,13 @@ class Clock:
         return self.times[rows.name], self.times[other.name]
 
 
-def _clock(path: Path, odometry: list[Topic], others: list[Topic], start: int, stamps: bool, notes: list[str]) -> Clock:
+def _clock(
+    path: Path, robots: list[_Robot], read: dict[str, Topic], start: int, stamps: bool, notes: list[str]
+) -> Clock:
     """Times of all topics; refuses clocks that disagree and times that go backwards."""
-    topics = [*odometry, *others]
+    odometry = [robot.odom for robot in robots]
+    poses = {topic.name for topic in odometry}
+    topics = [*odometry, *(topic for name, topic in read.items() if name not in poses)]
     stamped = {t.name: t.stamps for t in topics if stamps and t.stamps is not None and t.stamps.any()}
     lags = {t.name: _lag(t, stamped.get(t.name)) for t in topics}
     lead = next((t.name for t in odometry if t.name in stamped), odometry[0].name)

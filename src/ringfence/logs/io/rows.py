@@ -143,13 +143,7 @@ def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
     """A column of commands, whose last entry of each agent nobody follows: one that is missing is the one before."""
     last = np.flatnonzero(np.append(~rows.follows, True))
     last = last[last > 0]
-    here, before = rows.order[last], rows.order[last - 1]
-    missing = np.array([is_missing(entry) for entry in column[here]], bool)
-    if not missing.any():
-        return column
-    filled = column.copy()
-    filled[here[missing]] = column[before[missing]]
-    return filled
+    return _filled(column, rows.order[last], column[rows.order[last - 1]])
 
 
 def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
@@ -157,11 +151,16 @@ def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
     if column.dtype.kind not in "fO":  # no other has a missing number
         return column
     first = rows.order[np.append(True, ~rows.follows)]
-    missing = np.array([is_missing(entry) for entry in column[first]], bool)
+    return _filled(column, first, np.zeros(len(first), int))
+
+
+def _filled(column: np.ndarray, where: np.ndarray, instead: np.ndarray) -> np.ndarray:
+    """The column with what is `instead` (K,) of those of its rows `where` (K,) that are missing."""
+    missing = np.array([is_missing(entry) for entry in column[where]], bool)
     if not missing.any():
         return column
     filled = column.copy()
-    filled[first[missing]] = 0
+    filled[where[missing]] = instead[missing]
     return filled
 
 

@@ -95,30 +95,19 @@ def read_table(
     table. `card` adds fields to it; its `constraints` holds the limits of several costs (0 by default). `StoreError`
     names the first row that cannot be (counted from 0, without a header).
     """
-    return _read(table, schema, notes, card)[0]
+    return read_parts(table, schema, None, notes=notes, card=card)[0]
 
 
 def read_parts(
     table: Tables,
     schema: TableSchema,
-    share: float,
+    share: float | None,
     *,
     notes: Sequence[str] = (),
     card: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], int]:
     """The same, and how many of the episodes are of the first `share` of the time: these come first, and none is of
-    both parts."""
-    return _read(table, schema, notes, card, share)
-
-
-def _read(
-    table: Tables,
-    schema: TableSchema,
-    notes: Sequence[str],
-    card: Mapping[str, Any] | None,
-    share: float | None = None,
-) -> tuple[dict[str, Any], int]:
-    """What `from_steps` takes, and how many episodes are of the first `share` of the time."""
+    both parts. Without a share, all of the time is one part."""
     of_kind("card", card, Mapping | None, "give a dictionary of its fields")
     of_kind("notes", notes, Sequence, "give a list of sentences")
     columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])

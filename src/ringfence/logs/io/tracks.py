@@ -165,8 +165,7 @@ def resample(
     segments = _Segments.of(recording, agent, time, ended, gap)
     segment, step = segments.grid(dt)
     at, row = segments.placed(segment, step, dt)
-    fresh = np.ones(len(row), bool)
-    fresh[1:] = segment[1:] != segment[:-1]
+    fresh = is_first(segment)
     row = np.where(np.append(fresh[1:], True), segments.last[segment], row)  # what comes after the last step is of it
     before = np.where(fresh, segments.first[segment] - 1, np.concatenate([[0], row[:-1]]))
     return Tracks(
@@ -268,15 +267,23 @@ def _lasting(cost: np.ndarray, own: np.ndarray, fresh: np.ndarray) -> np.ndarray
     return np.where(lasts, cost[here] / np.maximum(here - before, 1)[:, None], cost)
 
 
+def is_first(*keys: np.ndarray) -> np.ndarray:
+    """(M,) whether a row has another of the keys (M,) than the one before; the first row has."""
+    return np.append(True, np.any([key[1:] != key[:-1] for key in keys], 0))
+
+
+def _moments(recording: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(index of the first row of each time, how many rows it has), of rows (M,) in the order of time."""
+    first = np.flatnonzero(is_first(recording, step))
+    return first, np.diff(np.append(first, len(step)))
+
+
 def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int]:
     """Windows in which the same agents are there: rows (W, N) of `tracks`, of everybody at a time; how many rows each
     window has; and N, by default the size that most rows belong to."""
     order = np.lexsort((tracks.agent, tracks.step, tracks.recording))
     recording, step, segment = (x[order] for x in (tracks.recording, tracks.step, tracks.segment))
-    begins = np.ones(len(order), bool)
-    begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
-    first = np.flatnonzero(begins)
-    many = np.diff(np.append(first, len(order)))
+    first, many = _moments(recording, step)
     # Who is there, as one number: two sets of segments share theirs once in 2^64.
     mark = np.random.default_rng(0).integers(0, 2**63, segment.max() + 1, np.uint64, endpoint=True)[segment]
     who = np.add.reduceat(mark, first)
@@ -312,12 +319,7 @@ def cut(rows: np.ndarray, fewest: int, most: int | None) -> tuple[np.ndarray, np
 def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float) -> np.ndarray:
     """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sensing_radius` m."""
     order = np.lexsort((tracks.step, tracks.recording))
-    recording = tracks.recording[order]
-    step = tracks.step[order]
-    begins = np.ones(len(order), bool)
-    begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
-    first = np.flatnonzero(begins)
-    many = np.diff(np.append(first, len(order)))
+    first, many = _moments(tracks.recording[order], tracks.step[order])
     found = np.full((len(order), k), -1)
     by_size = np.argsort(many, kind="stable")  # so that little is padded
     while len(by_size):
