@@ -54,7 +54,9 @@ def read_columns(table: Table, wanted: Iterable[str], form: Form = AS_USUAL) -> 
         found = {name: _array(name, table[name]) for name in known(wanted, list(table))}
     else:
         frame = _frame(table)
-        found = {name: _of_frame(name, frame[name]) for name in known(wanted, frame.columns)}
+        columns = {name: frame[name] for name in known(wanted, frame.columns)}
+        arrow = frame.implementation.is_pyarrow()
+        found = {name: as_numpy(name, x.to_native()) if arrow else x.to_numpy() for name, x in columns.items()}
     lengths = {len(column) if column.ndim in (1, 2) else -1 for column in found.values()}
     if len(lengths) != 1 or not lengths - {-1, 0}:
         shapes = ", ".join(f"{name} {column.shape}" for name, column in found.items())
@@ -128,7 +130,7 @@ def numbers(columns: Columns, name: str) -> np.ndarray:
     if column.dtype.kind == "O":
         others = [k for k, entry in enumerate(column) if not _is_number(entry)]
         # One word makes text of a whole column of a file; the row to repair is its own.
-        words = (k for k in others if not _reads_as_number(column[k]))
+        words = (k for k in others if not (isinstance(column[k], str) and _converts(column[k])))
         row = next(words, others[0] if others else None)
     if row is not None:
         remedy = _remedy(column[row]) or "repair or drop it"
@@ -213,11 +215,6 @@ def _frame(table: Any) -> Any:
         ) from None
 
 
-def _of_frame(name: str, column: Any) -> np.ndarray:
-    """A column of narwhals' as NumPy's."""
-    return as_numpy(name, column.to_native()) if column.implementation.is_pyarrow() else column.to_numpy()
-
-
 def needs(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
@@ -253,17 +250,13 @@ def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
     needs("pyarrow")
     table = None if path.suffix.lower() in PARQUET else _read_csv(path, form)
     names = names_in(path) if table is None else table.column_names
-    _refuse_twice(path, names)
+    twice = [name for name, times in Counter(names).items() if times > 1]
+    if twice:
+        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
     if wanted is None:
         return dict.fromkeys(names, np.zeros(0))
     known(wanted, names)
     return read_parquet([path], wanted) if table is None else {name: table.column(name).to_numpy() for name in wanted}
-
-
-def _refuse_twice(path: Path, names: list[str]) -> None:
-    twice = [name for name, times in Counter(names).items() if times > 1]
-    if twice:
-        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
 
 
 def _read_csv(path: Path, form: Form) -> Any:
@@ -293,19 +286,14 @@ def _read_csv(path: Path, form: Form) -> Any:
     )
 
 
-def _reads_as_number(entry: Any) -> bool:
+def _is_number(entry: Any) -> bool:
+    return isinstance(entry, Number) and not isinstance(entry, complex | np.complexfloating) and _converts(entry)
+
+
+def _converts(entry: Any) -> bool:
+    """Whether a number can be made of it, which an integer may be too large for."""
     try:
         float(entry)
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return isinstance(entry, str)
-
-
-def _is_number(entry: Any) -> bool:
-    if not isinstance(entry, Number) or isinstance(entry, complex | np.complexfloating):
-        return False
-    try:
-        float(entry)  # pyright: ignore[reportArgumentType]
     except (OverflowError, TypeError, ValueError):
         return False
     return True

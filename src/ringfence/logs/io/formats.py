@@ -27,7 +27,7 @@ WORDS = ("id", "type", "lane", "edge")
 MOTION = ("x", "y", "speed", "angle")  # which are numbers in every file
 
 
-# --- Parquet: runs of one value are stored as one, so that what a file unpacks to is counted first ---
+# --- Parquet ---
 def names_in(path: Path) -> list[str]:
     """Names of a file's columns."""
     from pyarrow import parquet
@@ -37,7 +37,8 @@ def names_in(path: Path) -> list[str]:
 
 
 def read_parquet(paths: Sequence[Path], wanted: Sequence[str]) -> dict[str, np.ndarray]:
-    """The wanted columns, which are there, of files after one another. Lists of one length are rows (M, entries)."""
+    """The wanted columns, which are there, of files after one another. Lists of one length are rows (M, entries). Runs
+    of one value are stored as one, so what the files unpack to is counted first."""
     stored = sum(path.stat().st_size for path in paths)
     whose = paths[0] if len(paths) == 1 else paths[0].parent
     affordable(whose, sum(_unpacked(path, wanted) for path in paths), stored=stored, loose=LOOSE)
@@ -97,17 +98,14 @@ def _shared_words(chunk: Any) -> np.ndarray:
 
 
 def _of_lists(column: Any) -> np.ndarray:
+    from pyarrow import types
+
+    plain = types.is_integer(column.type.value_type) or types.is_floating(column.type.value_type)
     lengths = column.combine_chunks().value_lengths().to_numpy(zero_copy_only=False)
-    if not _is_plain(column.type.value_type) or not len(lengths) or not (lengths == lengths[0]).all():
+    if not plain or not len(lengths) or not (lengths == lengths[0]).all():
         return column.to_numpy()
     flat = np.concatenate([chunk.flatten().to_numpy(zero_copy_only=False) for chunk in column.chunks])
     return flat.astype(np.float64, copy=False).reshape(len(lengths), -1)
-
-
-def _is_plain(kind: Any) -> bool:
-    from pyarrow import types
-
-    return types.is_integer(kind) or types.is_floating(kind)
 
 
 def _of_all(whose: Path, name: str, parts: list[np.ndarray]) -> np.ndarray:
@@ -120,10 +118,11 @@ def _of_all(whose: Path, name: str, parts: list[np.ndarray]) -> np.ndarray:
         raise StoreError(f"The files of '{whose}' hold '{name}' as {shapes}; write all of them in one way.") from None
 
 
-# --- JSON lines: an object for each row, whose own objects are joined to its names by dots (`pose.x`) ---
+# --- JSON lines ---
 def read_json_lines(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    """The wanted columns (M,) by name, and the names of all others without a row; what a row does not name is None
-    there. Lists stay lists."""
+    """The wanted columns (M,) of a file with an object for each row, by name, and the names of all others without a
+    row; what a row does not name is None there. A row's own objects are joined to its names by dots (`pose.x`). Lists
+    stay lists."""
     names: dict[str, None] = {}
     found: dict[str, tuple[list[int], list[Any]]] = {name: ([], []) for name in wanted or ()}  # rows and their values
     rows = 0
@@ -185,10 +184,11 @@ def _of_values(rows: int, where: list[int], values: list[Any]) -> np.ndarray:
     return column
 
 
-# --- obsmat.txt of the pedestrians of ETH (Pellegrini et al. 2009) and UCY: eight numbers a line without a header ---
-# Frame, pedestrian, x, z, y (m), vx, vz, vy (m/s). A pedestrian has a line every 0.4 s, whatever frames are counted by.
+# --- pedestrians of ETH (Pellegrini et al. 2009) and UCY ---
 def read_obsmat(path: Path) -> dict[str, np.ndarray]:
-    """Columns (M,) `time` (s), `agent`, `x`, `y` (m), `vx`, `vy` (m/s); the height is 0 throughout and left out."""
+    """Columns (M,) `time` (s), `agent`, `x`, `y` (m), `vx`, `vy` (m/s) of an `obsmat.txt`: eight numbers a line without
+    a header, of which the height is 0 throughout and left out. A pedestrian has a line every 0.4 s, whatever the frames
+    are counted by."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of an empty file, which is refused below
@@ -202,9 +202,13 @@ def read_obsmat(path: Path) -> dict[str, np.ndarray]:
             f"{' '.join(OBSMAT)}."
         )
     columns = dict(zip(OBSMAT, rows.T))
+    frame, agent = columns["frame"], columns["agent"]
+    time = frame * SPACING / _frames_between_lines(path, frame, agent)
+    if not (np.isfinite(agent) & (agent == np.round(agent))).all():
+        raise StoreError(f"'{path}' numbers a pedestrian otherwise than by whole numbers; give {' '.join(OBSMAT)}.")
     return {
-        "time": columns["frame"] * SPACING / _frames_between_lines(path, columns["frame"], columns["agent"]),
-        "agent": _whole_numbers(path, columns["agent"]),
+        "time": time,
+        "agent": agent.astype(np.int64),
         **{name: columns[name] for name in ("x", "y", "vx", "vy")},
     }
 
@@ -218,16 +222,12 @@ def _frames_between_lines(path: Path, frame: np.ndarray, agent: np.ndarray) -> f
     return float(np.median(apart))
 
 
-def _whole_numbers(path: Path, agent: np.ndarray) -> np.ndarray:
-    if not (np.isfinite(agent) & (agent == np.round(agent))).all():
-        raise StoreError(f"'{path}' numbers a pedestrian otherwise than by whole numbers; give {' '.join(OBSMAT)}.")
-    return agent.astype(np.int64)
-
-
-# --- SUMO's floating car data, XML (sumo.dlr.de/docs/Simulation/Output/FCDOutput.html) ---
-# A `timestep` holds the vehicles of that time: x and y (m), speed (m/s) and angle, in degrees clockwise from north.
+# --- SUMO ---
 def read_fcd(path: Path) -> dict[str, np.ndarray]:
-    """Columns (M,) `time`, `agent`, `vx`, `vy`, and every attribute that all vehicles have, numbers as float64."""
+    """Columns (M,) `time`, `agent`, `vx`, `vy`, and every attribute that all vehicles have, numbers as float64, of
+    floating car data (`--fcd-output`, sumo.dlr.de/docs/Simulation/Output/FCDOutput.html). Each `timestep` holds the
+    vehicles of that time: x and y (m), speed (m/s) and angle, the direction in degrees clockwise from north. Velocities
+    follow from the last two."""
     rows = _Vehicles(path)
     with path.open("rb") as file, reading(path, "XML", "write it again"):
         for begins in itertools.count(0, PIECE):  # expat begins anew at each piece of what it has not seen the end of

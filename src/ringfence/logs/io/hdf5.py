@@ -2,12 +2,11 @@
 
     DSRL    observations, next_observations (M, ...), actions (M, ...), rewards, costs, terminals, timeouts (M,)
     D4RL    observations, actions, rewards, terminals, timeouts; next_observations in some, and infos/, metadata/
-    Minari  episode_0, episode_1, ..., each with observations (T+1, ...), or a group of them, actions, rewards,
-            terminations, truncations (T,), infos/ (T+1 rows, the first of the reset); metadata.json beside the file
+    Minari  episode_0, episode_1, ..., a group of every episode (`minari.py`)
 
-The names and shapes are those of the repositories liuzuxin/DSRL (`dsrl/offline_env.py`, Liu et al. 2023),
-Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020) and Farama-Foundation/Minari
-(read in `minari.py`). What the files do not say, and is done here:
+The names and shapes are those of the repositories liuzuxin/DSRL (`dsrl/offline_env.py`, Liu et al. 2023) and
+Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020). What the files do not say, and is
+done here:
 
 * the state that an episode's last step led to is in `next_observations` or, with Minari, in the last row. D4RL's files
   without it give up the last step of every episode, whose own observation becomes the last state; since nothing is
@@ -23,7 +22,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -215,9 +213,10 @@ def _given_up(lengths: np.ndarray, terminated: np.ndarray) -> str:
 def _broken(path: Path, observations: np.ndarray, reached: np.ndarray, ends: np.ndarray) -> list[str]:
     """Whether inside episodes a step leads to the next row: refused where many do not, else noted."""
     before = np.flatnonzero(common.inside(ends))
-    some = observations[:: max(1, len(observations) // 100_000)].astype(np.float64)
-    slack = APART * some.std(0) + 1e-5 * np.abs(some).max(0)  # and single precision's rounding
-    wrong = [k[(np.abs(reached[k] - observations[k + 1]) > slack).any(1)] for k in _chunks(before)]
+    usual = observations[:: max(1, len(observations) // 100_000)].astype(np.float64)
+    slack = APART * usual.std(0) + 1e-5 * np.abs(usual).max(0)  # and single precision's rounding
+    some = (before[k : k + CHUNK] for k in range(0, len(before), CHUNK))
+    wrong = [k[(np.abs(reached[k] - observations[k + 1]) > slack).any(1)] for k in some]
     wrong = np.concatenate([*wrong, np.zeros(0, int)])
     if len(wrong) > STRAYS * len(before):
         raise StoreError(
@@ -230,7 +229,3 @@ def _broken(path: Path, observations: np.ndarray, reached: np.ndarray, ends: np.
         f"{len(wrong)} steps inside episodes, row {wrong[0]} first, do not lead to the next row; its observation was "
         "taken for where they led"
     ]
-
-
-def _chunks(rows: np.ndarray) -> Iterator[np.ndarray]:
-    return (rows[k : k + CHUNK] for k in range(0, len(rows), CHUNK))

@@ -71,15 +71,7 @@ class ObservationLog(Log):
     observations: np.ndarray  # (T, N, O)
 
 
-@dataclass(frozen=True)
-class Made:
-    """What is made of a recording; T steps."""
-
-    steps: dict[str, Any]  # arrays by name, as `EpisodeStore.from_steps` takes them
-    speed: np.ndarray  # (T,) m/s
-    speed_names: tuple[str, ...]  # the entries whose norm the speed is
-    names: list[str]  # of an observation's entries
-    simulator: str  # that it was recorded with
+Made = tuple[dict[str, Any], np.ndarray, str]  # arrays by name, (T,) speed in m/s, what it was recorded with
 
 
 def read_vault(vault: Path, env: SafeMuJoCo) -> dict[str, Any]:
@@ -183,24 +175,27 @@ def _steps(log: StateLog | ObservationLog, env: SafeMuJoCo, provenance: str, not
     arrays = ("state", "contact", "observations", "actions", "rewards")
     _check_finite(log.where, {name: getattr(log, name, None) for name in arrays})
     ends = _ends(log, env, notes)
-    made = (
-        _from_states(log, env, ends, notes) if isinstance(log, StateLog) else _from_observations(log, env, ends, notes)
-    )
-    short = int((np.diff(ends, prepend=0) < env.episode_length).sum() - made.steps["terminated"].sum())
+    if isinstance(log, StateLog):
+        steps, speed, simulator = _from_states(log, env, ends, notes)
+        names, fast = list(env.observation_names), ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)
+    else:
+        steps, speed, simulator = _from_observations(log, env, ends, notes)
+        names, fast = _old_names(log.observations.shape[2], env), ("torso.vx",)
+    short = int((np.diff(ends, prepend=0) < env.episode_length).sum() - steps["terminated"].sum())
     if env.ant and short:
         notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
     card = {
-        "simulator": made.simulator,
+        "simulator": simulator,
         "provenance": provenance,
         "agents": [f"agent{i}" for i in range(env.n_agents)],
-        "observation_names": made.names,
-        "state_names": list(env.state_names) if "state" in made.steps else [],
-        "hazard": constraints.to_dict(constraints.SpeedLimit(env.limit, made.speed_names)),
+        "observation_names": names,
+        "state_names": list(env.state_names) if "state" in steps else [],
+        "hazard": constraints.to_dict(constraints.SpeedLimit(env.limit, fast)),
         "episode_length": env.episode_length,
         "warnings": notes,
-        **env.describe(made.speed, COST_LIMIT),
+        **env.describe(speed, COST_LIMIT),
     }
-    return {**made.steps, "costs": made.speed > env.limit, "card": card}
+    return {**steps, "costs": speed > env.limit, "card": card}
 
 
 def _ends(log: StateLog | ObservationLog, env: SafeMuJoCo, notes: list[str]) -> np.ndarray:
@@ -287,9 +282,7 @@ def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[s
         "state": state,
         "final_state": final_state,
     }
-    names = ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)
-    simulator = "gymnasium-robotics, version not recorded" if newer else RECORDED_WITH
-    return Made(steps, speed, names, list(env.observation_names), simulator)
+    return steps, speed, "gymnasium-robotics, version not recorded" if newer else RECORDED_WITH
 
 
 def _unpaid_falls(outcome: Outcome, rewards: np.ndarray) -> np.ndarray:
@@ -320,8 +313,7 @@ def _from_observations(log: ObservationLog, env: SafeMuJoCo, ends: np.ndarray, n
         "final_observations": observations[last],
         "terminated": np.zeros(len(ends), bool),
     }
-    speed = np.abs(_forward_speed(log, env, total))[kept]
-    return Made(steps, speed, ("torso.vx",), _old_names(observations.shape[2], env), RECORDED_WITH)
+    return steps, np.abs(_forward_speed(log, env, total))[kept], RECORDED_WITH
 
 
 def _one_step(env: SafeMuJoCo, state: np.ndarray, actions: np.ndarray) -> tuple[Outcome, np.ndarray]:

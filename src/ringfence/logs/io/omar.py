@@ -71,6 +71,7 @@ def read_seed(directory: Path, hazard: constraints.Hazard, episode_length: int =
         final = observations[last]
         terminated = np.zeros(len(ends), bool)  # where they ended is not recorded
     observations = observations[steps]
+    silent = [f"other{j}.said{c}" for j in range(n - 1) for c in "01"]  # the channel, which nobody speaks on
     state, final_state = _global_state(env, observations), _global_state(env, final)
     return {
         "observations": observations,
@@ -88,7 +89,7 @@ def read_seed(directory: Path, hazard: constraints.Hazard, episode_length: int =
             "integrator": "velocity_first",
             "reward": "omar",
             "agents": [f"agent{i}" for i in range(n)],
-            "observation_names": list(_observation_names(n)),
+            "observation_names": [*env.feature_map("decentralized").names, *silent],
             "state_names": list(env.state_names),
             "hazard": constraints.to_dict(hazard),
             "episode_length": episode_length,
@@ -282,9 +283,3 @@ def _costs(hazard: constraints.Hazard, env: SimpleSpread, reached: np.ndarray) -
     chunks = [reached[start : start + CHUNK] for start in range(0, len(reached), CHUNK)]
     unsafe = [labels(view(None, chunk))[0] for chunk in chunks]
     return np.any(np.concatenate(unsafe), axis=-1).astype(np.float32)
-
-
-def _observation_names(n: int) -> tuple[str, ...]:
-    """Names as in the `decentralized` view, with the silent channel behind them."""
-    spoken = tuple(f"other{j}.said{c}" for j in range(n - 1) for c in "01")
-    return SimpleSpread(n_agents=n).feature_map("decentralized").names + spoken

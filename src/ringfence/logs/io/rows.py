@@ -237,14 +237,10 @@ def doubts(rows: Rows, values: Values, dt: float, schema: TableSchema) -> Iterat
         yield "state holds no x, y or z, so nobody sees where others are relative to oneself"
 
 
-def _moved(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
-    """(M-1, axes of the position) m/s since the row before; 0 where another agent's rows begin."""
-    passed = np.where(rows.follows, np.diff(rows.time), np.inf)
-    return np.diff(values.stacked(schema.position), axis=0) / passed[:, None]
-
-
 def _speeds(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
-    return np.linalg.norm(_moved(rows, values, schema), axis=1)
+    """(M-1,) m/s since the row before; 0 where another agent's rows begin."""
+    passed = np.where(rows.follows, np.diff(rows.time), np.inf)
+    return np.linalg.norm(np.diff(values.stacked(schema.position), axis=0) / passed[:, None], axis=1)
 
 
 def blurred(rows: Rows, values: Values) -> Iterator[str]:

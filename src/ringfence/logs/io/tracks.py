@@ -64,14 +64,10 @@ def _step(rows: Rows) -> float:
     nice = [float(f"{rows.step:.6g}"), hertz, float(f"{mean:.6g}")]
     if abs(hertz / rows.step - 1) < DIGITS:
         nice.insert(0, hertz)
-    longest = float(_spans(rows).max())
+    begins = np.flatnonzero(is_first(rows.recording))
+    spans = np.maximum.reduceat(rows.time, begins) - np.minimum.reduceat(rows.time, begins)  # of each recording
+    longest = float(spans.max())
     return next((step for step in nice if abs(step / mean - 1) * longest <= EXACT * step), mean)
-
-
-def _spans(rows: Rows) -> np.ndarray:
-    """(recordings,) s from the first row to the last."""
-    begins = np.flatnonzero(np.diff(rows.recording, prepend=-1))
-    return np.maximum.reduceat(rows.time, begins) - np.minimum.reduceat(rows.time, begins)
 
 
 # --- drift ---
@@ -80,7 +76,7 @@ def on_whole_steps(rows: Rows, clock: Clock) -> tuple[Rows, list[str]]:
     would slip by more than a quarter of a step, steps are counted by rows, and a sentence says how far it drifted."""
     spacing = _spacing(clock.dt, rows.step)
     time = rows.time.copy()
-    begins = np.flatnonzero(np.diff(rows.recording, prepend=-1))
+    begins = np.flatnonzero(is_first(rows.recording))
     furthest = 0.0
     for here in (slice(*ends) for ends in zip(begins, [*begins[1:], len(time)])):
         time[here] -= time[here].min()

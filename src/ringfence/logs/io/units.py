@@ -98,7 +98,7 @@ def _middle(zone: int) -> float:
 def without_angles(columns: Columns, schema: TableSchema) -> tuple[Columns, TableSchema, list[str]]:
     """The columns and the schema with `cos_yaw` and `sin_yaw` instead of `yaw`, and a note. Angles are known by their
     names; they are in radians, `compass` and what ends in `_deg` in degrees."""
-    angles = [name for name in schema.state if _is_angle(name)]
+    angles = [name for name in schema.state if _plain(name) in ANGLES]
     if not angles:
         return columns, schema, []
     found = dict(columns)
@@ -126,10 +126,6 @@ def _radians(columns: Columns, name: str) -> np.ndarray:
             f"if it counts turns in radians, {name}_rad."
         )
     return angle_of(name, value)
-
-
-def _is_angle(name: str) -> bool:
-    return _plain(name) in ANGLES
 
 
 def _in_degrees(name: str) -> bool:
