@@ -191,7 +191,7 @@ def import_hdf5(
     path = hdf5.located(path)
     steps, name = hdf5.read_hdf5(path, asked)
     try:
-        return EpisodeStore(**{**steps, "card": complete_card(steps["card"] | {"task": _free_name(name)} | known)})
+        return EpisodeStore.from_steps(**{**steps, "card": {**steps["card"], "task": _free_name(name), **known}})
     except UserError as error:
         raise StoreError(f"'{path}': {error}") from None
 

@@ -69,7 +69,8 @@ class Logs:
     """One stream of T steps in E episodes, not yet shared out among agents."""
 
     layout: str
-    observations: np.ndarray  # (T + E, O) as in a store
+    observations: np.ndarray  # (T, O)
+    final: np.ndarray  # (E, O) what each episode ended in
     actions: np.ndarray  # (T, A)
     rewards: np.ndarray  # (T,)
     costs: np.ndarray | None  # (T,), None where nothing is recorded
@@ -157,18 +158,19 @@ def flattened(*shapes: tuple[int, ...]) -> list[str]:
 
 # --- agents ---
 def shared_out(path: Path, log: Logs, agents: Agents | None) -> dict[str, Any]:
-    """What an `EpisodeStore` takes, of the steps shared out among agents; its card has no task."""
+    """What `EpisodeStore.from_steps` takes, of the steps shared out among agents; its card has no task."""
     bounds = log.bounds
     notes = list(log.notes)
     names = log.names
-    seen, done = log.observations[:, None], log.actions[:, None]
+    seen, final, done = (x[:, None] for x in (log.observations, log.final, log.actions))
     card: dict[str, Any] = {"agents": ["agent0"]}
     if agents is not None:
         looks, moves = ([agent[kind] for agent in agents.values()] for kind in ("observation", "action"))
-        rows = len(seen) * max(map(len, looks)) + len(done) * max(map(len, moves))
+        rows = (len(seen) + len(final)) * max(map(len, looks)) + len(done) * max(map(len, moves))
         arrays.fits(path, 4 * rows * len(agents))
         bounds = _bounds_of_agents(bounds, moves)
-        seen, done = _taken(log.observations, looks), _taken(log.actions, moves, bounds.middle)
+        seen, final = _taken(log.observations, looks), _taken(log.final, looks)
+        done = _taken(log.actions, moves, bounds.middle)
         sizes = [len(own) for own in moves]
         card = {"agents": list(agents), "columns": agents}
         card |= {"action_sizes": sizes} if len({*sizes}) > 1 else {}
@@ -176,16 +178,14 @@ def shared_out(path: Path, log: Logs, agents: Agents | None) -> dict[str, Any]:
         names = [names[k] for k in looks[0]] if names and len(agents) == 1 else None  # several see different columns
     if log.costs is None:
         notes.append("no costs are recorded, so every step has 0: what is learned from this knows no danger")
-    last = np.zeros((2, len(done)), bool)
-    last[np.where(log.terminated, 0, 1), log.ends - 1] = True
     return {
-        "observations": np.ascontiguousarray(seen),
+        "observations": seen,
         "actions": np.ascontiguousarray(done),
-        "rewards": np.repeat(log.rewards[:, None], seen.shape[1], 1),
-        "costs": np.zeros(len(done), np.float32) if log.costs is None else log.costs,
-        "terminated": last[0],
-        "truncated": last[1],
+        "rewards": log.rewards,
+        "costs": log.costs,
+        "terminated": log.terminated,
         "episode_ends": log.ends,
+        "final_observations": final,
         "card": {
             **card,
             "simulator": log.simulator,

@@ -43,8 +43,8 @@ CHUNK = 50_000  # rows at a time
 
 
 def read_hdf5(path: Path, asked: common.Asked) -> tuple[dict[str, Any], str]:
-    """What an `EpisodeStore` takes, of a DSRL, D4RL or Minari file, and the data's own name. The layout is recognised
-    by the names in the file."""
+    """What `EpisodeStore.from_steps` takes, of a DSRL, D4RL or Minari file, and the data's own name. The layout is
+    recognised by the names in the file."""
     with reading(path, "HDF5 of DSRL, D4RL or Minari"), h5py.File(path, "r") as f:
         episodes = _recognised(path, f)
         log = minari.read(path, f, episodes, asked) if episodes else _flat(path, f, asked)
@@ -143,7 +143,7 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
     if following is not None:
         reached = common.numbers(path, "next_observations", following, kept)
         notes += _broken(path, observations, reached, ends)
-        observations = np.insert(observations, ends, reached[ends - 1], axis=0)
+        final = reached[ends - 1]
     else:
         notes.append(_given_up(np.diff(ends, prepend=0), terminated))
         steps, ends, last = common.without_last_steps(ends)
@@ -152,10 +152,10 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
                 f"'{path}' has no next_observations and no episode of two steps, so nothing says where a step led; "
                 "add next_observations."
             )
-        observations = np.insert(observations[steps], ends, observations[last], axis=0)
-        actions, rewards = actions[steps], rewards[steps]
+        final = observations[last]
+        observations, actions, rewards = observations[steps], actions[steps], rewards[steps]
         terminated = np.zeros(len(ends), bool)
-    return common.Logs(layout, observations, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
+    return common.Logs(layout, observations, final, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
 
 
 def _ends(path: Path, last: np.ndarray) -> np.ndarray:

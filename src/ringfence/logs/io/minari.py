@@ -59,14 +59,14 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     found = _with_steps(path, found, notes)
     ends = np.cumsum([shapes.steps for shapes in found.values()], dtype=np.int64)
     steps = int(ends[-1])
-    observations = np.empty((steps + len(ends), seen), np.float32)
-    actions, rewards, costs = (np.empty(s, np.float32) for s in ((steps, acted), (steps,), (steps,)))
+    sizes = ((steps, seen), (len(ends), seen), (steps, acted), (steps,), (steps,))
+    observations, final, actions, rewards, costs = (np.empty(size, np.float32) for size in sizes)
     terminated, truncated = np.zeros((2, len(ends)), bool)
     for k, (name, shapes) in enumerate(found.items()):
         stop = int(ends[k])
         now = slice(stop - shapes.steps, stop)
-        seen_here = [_numbers(path, f, f"{name}/{key}") for key in shapes.observations]
-        observations[now.start + k : stop + k + 1] = np.concatenate(seen_here, 1)
+        rows = np.concatenate([_numbers(path, f, f"{name}/{key}") for key in shapes.observations], 1)
+        observations[now], final[k] = rows[:-1], rows[-1]
         actions[now] = np.concatenate([_numbers(path, f, f"{name}/{key}") for key in shapes.actions], 1)
         common.within(path, f"{name}/actions", actions[now], bounds)
         rewards[now] = _numbers(path, f, f"{name}/rewards")[:, 0]
@@ -80,6 +80,7 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     return common.Logs(
         "Minari",
         observations,
+        final,
         actions,
         rewards,
         costs if first.cost else None,
