@@ -13,8 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ringfence.datasets.importers.hdf5 import import_hdf5
-from ringfence.datasets.importers.omar import import_omar
+from ringfence.datasets.importers import import_hdf5, import_omar
 from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.store import EpisodeStore
 from tests import corpus

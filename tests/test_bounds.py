@@ -240,7 +240,7 @@ def test_files_are_imported_with_bounds_of_each_entry(tmp_path):
     import h5py
 
     from ringfence.cli import app
-    from ringfence.datasets.importers.hdf5 import import_hdf5
+    from ringfence.datasets.importers import import_hdf5
 
     file = tmp_path / "flat.hdf5"
     rng = np.random.default_rng(0)

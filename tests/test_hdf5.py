@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from ringfence.cli.app import main
-from ringfence.datasets.importers.columns import read as read_columns
-from ringfence.datasets.importers.hdf5 import import_hdf5
+from ringfence.datasets.importers import import_hdf5
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.common import read_agents
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop
 from ringfence.utils import arrays
@@ -207,7 +207,7 @@ def test_maps_that_do_not_fit_are_refused(tmp_path, given, said):
 def test_a_map_larger_than_any_is_not_read(tmp_path):
     (tmp_path / "map.json").write_text(" " * (2**20 + 1))
     with pytest.raises(StoreError, match="larger than 1 MiB"):
-        read_columns(tmp_path / "map.json")
+        read_agents(tmp_path / "map.json")
 
 
 # --- bad flat files ---

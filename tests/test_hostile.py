@@ -455,7 +455,7 @@ def test_a_pipe_in_a_run_folder_is_not_waited_for(name, trained_run, tmp_path, i
 
 
 def test_a_pipe_among_logs_is_not_waited_for(tmp_path, in_time):
-    from ringfence.datasets.importers.omar import import_omar
+    from ringfence.datasets.importers import import_omar
     from ringfence.logs.io.rosbag import read_bag
 
     for kind in ("obs", "acs", "rews", "dones"):

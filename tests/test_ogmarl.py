@@ -10,12 +10,12 @@ import pytest
 
 from ringfence.datasets import registry
 from ringfence.datasets.audit import audit
-from ringfence.datasets.importers import ogmarl
-from ringfence.datasets.importers.ogmarl import import_madiff, import_vault
+from ringfence.datasets.importers import import_madiff, import_vault
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import StoreError, UserError
 from ringfence.evaluation import protocol
 from ringfence.loading.resolve import load
+from ringfence.logs.io.ogmarl import OLD_OBSERVATION
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.training import loop
@@ -99,7 +99,7 @@ def write_madiff(folder, log, parts, reverse=True):
             rows.append(np.column_stack([*own, at[f"{other}thigh.q"], *world]))
         seen = np.stack(rows, 1)
     else:
-        width = ogmarl.OLD_OBSERVATION[parts]
+        width = OLD_OBSERVATION[parts]
         seen = np.random.default_rng(1).normal(size=(steps, n, width))
         seen[:, :, -2] = at["torso.vx"][:, None]
     number = np.broadcast_to(np.eye(n), (steps, n, n))

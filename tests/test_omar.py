@@ -9,7 +9,7 @@ import pytest
 
 from ringfence.cli.app import main
 from ringfence.datasets import behaviour, registry
-from ringfence.datasets.importers.omar import import_omar
+from ringfence.datasets.importers import import_omar
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.store import EpisodeStore

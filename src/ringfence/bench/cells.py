@@ -30,7 +30,7 @@ from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.datasets.task import Task
 from ringfence.datasets.version import RECIPES
-from ringfence.errors import RunConflict, UserError, unknown, whole_number
+from ringfence.errors import RunConflict, UserError, one_of, unknown, whole_number
 from ringfence.evaluation import protocol, reference
 from ringfence.evaluation.evaluate import evaluate_spec
 from ringfence.guards import GuardOptions, options_of
@@ -313,9 +313,7 @@ def make_grid(
     transitions: int | None = None,
 ) -> Grid:
     """The grid of a suite, or of the named tasks and entries (`algorithm` or `algorithm:preset`) of it."""
-    if suite not in SUITES:
-        raise unknown("suite", suite, SUITES)
-    chosen = SUITES[suite]
+    chosen = one_of("suite", suite, SUITES)
     episodes = chosen.episodes if episodes is None else episodes
     seeds = whole_number("seeds", seeds, 1, 10_000)
     episodes = whole_number("episodes", episodes, 1, 10**7)

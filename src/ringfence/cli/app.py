@@ -680,12 +680,11 @@ def _group_of(arguments: list[str]) -> tuple[list[str], dict[str, Any], str]:
 def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:
     """Refuse bad names before a data set is made for them."""
     from ringfence import algos
-    from ringfence.errors import unknown
+    from ringfence.errors import one_of
 
     a = algos.get(algorithm)
     preset = preset or a.preset_for(())
-    if preset not in a.presets:
-        raise unknown(f"preset of {a.name}", preset, a.presets)
+    one_of(f"preset of {a.name}", preset, a.presets)
     algos.configured(a, preset, changes)
 
 

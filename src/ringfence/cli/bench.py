@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from ringfence.cli.console import complain, console
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, one_of
 from ringfence.utils.escape import terminal
 
 if TYPE_CHECKING:
@@ -130,9 +130,7 @@ def _grids(
         return root, paper.grids(root, only_tasks, only, **sizes)
     if suite in COLLECTIONS:
         return root, make_grids(collected(suite, only_tasks), root, only, **sizes)
-    if suite not in SUITES:
-        raise unknown("suite", suite, SUITES)
-    root = out_dir or root / (SUITES[suite].folder or suite)
+    root = out_dir or root / (one_of("suite", suite, SUITES).folder or suite)
     return root, [make_grid(suite, root, only_tasks=only_tasks, only=only, **sizes)]
 
 

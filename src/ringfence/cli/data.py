@@ -285,7 +285,7 @@ def import_omar(
         radius: m between two agents' centres below which a step costs 1; 0.30 by default, and another one needs --task.
         task: a name for the data; that of the tier in the directory's path by default.
     """
-    from ringfence.datasets.importers.omar import import_omar
+    from ringfence.datasets.importers import import_omar
     from ringfence.problem.constraints import Separation
 
     if radius is not None and task is None:
@@ -313,7 +313,7 @@ def import_ogmarl(
         quantile: take the limit of the tier's `-quantile` task.
         tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
     """
-    from ringfence.datasets.importers.ogmarl import import_vault
+    from ringfence.datasets.importers import import_vault
 
     file = writable(out_file)
     imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), file)
@@ -337,7 +337,7 @@ def import_madiff(
         quantile: take the limit of the tier's `-quantile` task.
         tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
     """
-    from ringfence.datasets.importers.ogmarl import import_madiff
+    from ringfence.datasets.importers import import_madiff
 
     file = writable(out_file)
     imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), file)
@@ -363,7 +363,7 @@ def import_hdf5(
         action_low: bound of all action entries, or one of each; Minari's action space tells it by default, else -1.
         action_high: likewise, else 1.
     """
-    from ringfence.datasets.importers.hdf5 import import_hdf5
+    from ringfence.datasets.importers import import_hdf5
 
     target = _another(out_file, file, "its own import")
     bounds = {"action_low": action_low, "action_high": action_high}

@@ -10,9 +10,9 @@ from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike, System
 from ringfence.envs.base import Env, NativeEnv
 from ringfence.envs.crossing import Body
-from ringfence.envs.mujoco import Parts
+from ringfence.envs.mujoco import COST_LIMIT, Parts
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
-from ringfence.errors import StoreError, UserError, unknown
+from ringfence.errors import StoreError, UserError, one_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 
@@ -59,12 +59,11 @@ def _spread_alike(tier: str) -> Task:
     )
 
 
-ROBOT_COST_LIMIT = 25.0  # steps above the speed limit per episode, Safety-Gymnasium's
 # OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return.
 _ROBOTS: dict[Parts, Constants] = {
-    "2x3": {"return_min": -280.18, "return_max": 9132.25, "cost_limit": ROBOT_COST_LIMIT},
-    "2x4": {"return_min": -325.6, "return_max": 3362.44, "cost_limit": ROBOT_COST_LIMIT},
-    "4x2": {"return_min": -325.6, "return_max": 3224.91, "cost_limit": ROBOT_COST_LIMIT},
+    "2x3": {"return_min": -280.18, "return_max": 9132.25, "cost_limit": COST_LIMIT},
+    "2x4": {"return_min": -325.6, "return_max": 3362.44, "cost_limit": COST_LIMIT},
+    "4x2": {"return_min": -325.6, "return_max": 3224.91, "cost_limit": COST_LIMIT},
 }
 # m/s: the 60th percentile of the step speed in a tier's own data, as regenerated in full with seed 0.
 QUANTILE_LIMITS = {
@@ -199,9 +198,7 @@ TASKS = {
 
 def get(name: str) -> Task:
     """The task of that name; an unknown one is refused with the nearest name."""
-    if name not in TASKS:
-        raise unknown("task", name, TASKS)
-    return TASKS[name]
+    return one_of("task", name, TASKS)
 
 
 def of_team(task: Task, agents: int) -> Task:

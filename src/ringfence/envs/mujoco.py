@@ -44,6 +44,7 @@ RESET_SPREAD = 0.1  # of joint positions (uniform) and velocities (standard devi
 HEALTHY_Z = (0.2, 1.0)  # m, the Ant's torso; outside the episode ends
 MARGIN = 0.01  # m, contact margin of the Ant's geoms in Gymnasium's file
 LIMITS = {"2x3": 3.227, "2x4": 2.522, "4x2": 2.418}  # m/s, safety-gymnasium's
+COST_LIMIT = 25.0  # steps above the speed limit per episode, Safety-Gymnasium's
 CREEPING = 0.6  # m/s: below that limit a guard pushes an Ant less
 
 Parts = Literal["2x3", "2x4", "4x2"]

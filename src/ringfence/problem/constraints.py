@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, one_of, unknown
 from ringfence.problem.entries import Entries, axes_of
 from ringfence.types import Array
 
@@ -247,14 +247,12 @@ def from_dict(data: Mapping[str, Any]) -> Hazard:
     kinds = {"Separation": Separation, "SpeedLimit": SpeedLimit, "CostColumn": CostColumn, "All": All}
     data = dict(data)  # a TypeError where it is no mapping
     kind = data.pop("kind", "")
-    if kind not in kinds:
-        raise unknown("hazard", str(kind), kinds)
+    made = one_of("hazard", kind, kinds)
     if kind == "All":
         return All(tuple(from_dict(h) for h in data.get("hazards", ())))
-    fields = {f.name: f for f in dataclasses.fields(kinds[kind])}
+    fields = {f.name: f for f in dataclasses.fields(made)}
     for name in data:
-        if name not in fields:
-            raise unknown(f"field of hazard {kind}", name, fields)
+        one_of(f"field of hazard {kind}", name, fields)
     for name, field in fields.items():
         if name not in data and field.default is dataclasses.MISSING:
             raise UserError(f"Hazard {kind} needs a value of '{name}'; add it to the card.")

@@ -17,16 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.problem import partners
-from ringfence.problem.entries import Entries
+from ringfence.problem.entries import SPACE, Entries
+from ringfence.problem.partners import ENTRIES, EXACT
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
-EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
 LESS = 0.5  # of a change that is left of that of a velocity relative to one's own, once one's own is added
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
-AXES = "xyz"
 MEANING = ("own", "other", "agent", "obs", "state")  # words that name something else, or nothing
 
 
@@ -57,10 +56,10 @@ def inferred_names(
     fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)]) or _listed(steps)
     places = [f for f in fields if not any(f is other.speed for other in fields)]
     moving = [f for f in places if f.speed is not None] or places
-    if len(moving) > len(AXES):
+    if len(moving) > len(SPACE):
         return tuple(names)
     found: dict[int, str] = {}
-    for axis, place in zip(AXES, moving):
+    for axis, place in zip(SPACE, moving):
         found |= _of_axis(steps, place, axis)
     found |= dict(_still(steps, moving, set(found)))
     found |= _heading(steps, found)
@@ -233,7 +232,7 @@ def _still(steps: Steps, places: Sequence[_Field], named: set[int]) -> Iterator[
         free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
         found.append([e for e in free if steps.equal(steps.change([e])[..., 0].ravel(), -moved, place.own)])
     for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*found)):
-        for axis, entry in zip(AXES, entries):
+        for axis, entry in zip(SPACE, entries):
             yield entry, f"still_{letter}.d{axis}"
 
 
@@ -302,7 +301,7 @@ def _things(steps: Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]
     own."""
     at = {name: entry for entry, name in found.items()}
     pairs = []
-    for axis in AXES:
+    for axis in SPACE:
         if (own := at.get(f"own.v{axis}")) is None:
             break
         free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
@@ -314,7 +313,7 @@ def _things(steps: Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]
                 pairs[-1].append((place, speed))
                 free.remove(place)
     for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*pairs)):
-        for axis, (place, speed) in zip(AXES, entries):
+        for axis, (place, speed) in zip(SPACE, entries):
             yield place, f"thing_{letter}.d{axis}"
             yield speed, f"thing_{letter}.dv{axis}"
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ringfence.errors import plain, unknown
+from ringfence.errors import one_of, plain
 from ringfence.report import html
 from ringfence.report.board import Board, read
 from ringfence.report.board_page import rankings, short
@@ -48,9 +48,8 @@ COLUMNS = ("suite", "task", "algorithm", "preset", "variant", "method", "rank", 
 
 def export_board(folder: str | Path, form: str, out: str | Path) -> Path:
     """Write the leaderboard of a results folder to the file `out`; `form` is a name in FORMS."""
-    if form not in FORMS:
-        raise unknown("format", form, FORMS)
-    return html.write(Path(out), FORMS[form](read(folder)))
+    exported = one_of("format", form, FORMS)
+    return html.write(Path(out), exported(read(folder)))
 
 
 def _rows(board: Board) -> dict[str, list[Line | Method]]:

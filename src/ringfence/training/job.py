@@ -9,7 +9,7 @@ from typing import Any
 from ringfence import algos
 from ringfence.datasets.audit import DISAGREE, disagreement
 from ringfence.datasets.task import Task
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, one_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.problem.origins import NOWHERE, Origins
@@ -72,8 +72,7 @@ def make_job(
     the World."""
     a = algos.get(algorithm)
     preset = preset or a.preset_for(task.presets)
-    if preset not in a.presets:
-        raise unknown(f"preset of {a.name}", preset, a.presets)
+    one_of(f"preset of {a.name}", preset, a.presets)
     limits: dict[str, float] = {}
     if task.env is None and store is not None and a.limit is not None and store.card.cost_limit is not None:
         limits[a.limit] = float(store.card.cost_limit)

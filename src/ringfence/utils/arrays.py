@@ -14,6 +14,8 @@ import h5py
 from ringfence.errors import StoreError
 from ringfence.utils.files import LOOSE
 
+PACKED = 20  # times its size that a compressed file may unpack to; columns of zeros pack well
+
 
 def member(path: Path, group: h5py.Group, name: str, label: str | None = None) -> h5py.Group | h5py.Dataset:
     """What lies in a group under that name; `label` is what messages call it. Links are not followed."""
@@ -38,7 +40,7 @@ def array(path: Path, group: h5py.Group, name: str, label: str | None = None) ->
     return found
 
 
-def affordable(path: Path, size: int, ratio: int, stored: int | None = None, loose: int = LOOSE) -> None:
+def affordable(path: Path, size: int, ratio: int = PACKED, stored: int | None = None, loose: int = LOOSE) -> None:
     """Refuse arrays of `size` bytes that memory cannot take, or that a file of its size (`stored` bytes, that of
     `path` by default) cannot hold though it were compressed `ratio` to one."""
     fits(path, size)

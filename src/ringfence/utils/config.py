@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, one_of, unknown
 
 Count = Annotated[int, Meta(ge=1, le=10**9)]  # updates
 BatchSize = Annotated[int, Meta(ge=1, le=10**8)]
@@ -60,9 +60,7 @@ def build_config(config: type[C], changes: Mapping[str, Any], of: str) -> C:
     fields = fields_of(config)
     values = {}
     for name, given in changes.items():
-        if name not in fields:
-            raise unknown(f"config field of {of}", name, fields)
-        field = fields[name]
+        field = one_of(f"config field of {of}", name, fields)
         value = read_text(field, given) if isinstance(given, str) else _of_type(field, given, of)
         refuse_out_of_bounds(field, value, of)
         values[name] = value

@@ -54,10 +54,6 @@ def _ackermann(drive) -> tuple[float, ...]:
     return drive.speed, drive.steering_angle
 
 
-def _scalar(m) -> tuple[float]:
-    return (m.data,)
-
-
 ROLES: dict[str, dict[str, Callable]] = {
     "odom": {
         "nav_msgs/msg/Odometry": _odometry,
@@ -72,7 +68,7 @@ ROLES: dict[str, dict[str, Callable]] = {
         "ackermann_msgs/msg/AckermannDriveStamped": lambda m: _ackermann(m.drive),
     },
     "joints": {"sensor_msgs/msg/JointState": lambda m: (tuple(m.name), m.position, m.velocity)},
-    "cost": {f"std_msgs/msg/{kind}": _scalar for kind in ("Bool", "Float32", "Float64", "Int32")},
+    "cost": {f"std_msgs/msg/{kind}": lambda m: (m.data,) for kind in ("Bool", "Float32", "Float64", "Int32")},
 }
 
 

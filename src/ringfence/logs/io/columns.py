@@ -6,7 +6,7 @@ import importlib
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
 from numbers import Number
@@ -17,10 +17,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, reading, reason, unknown
-from ringfence.logs.io.jsonlines import read_json_lines
-from ringfence.logs.io.obsmat import read_obsmat
-from ringfence.logs.io.parquet import as_numpy, names_in, read_parquet
-from ringfence.logs.io.sumo import read_fcd
+from ringfence.logs.io.formats import as_numpy, names_in, read_fcd, read_json_lines, read_obsmat, read_parquet
 
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
 Tables = Table | list[Table] | tuple[Table, ...]  # one, or several recordings
@@ -29,6 +26,7 @@ READERS: dict[str, Callable[[Path], Columns]] = {".xml": read_fcd, ".txt": read_
 LINES = (".jsonl", ".ndjson")
 PARQUET = (".parquet", ".pq")
 KINDS = (".csv", *PARQUET, *LINES, *READERS)
+LONGEST = 1000  # entries of a list
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,9 @@ def read_columns(table: Table, wanted: Iterable[str], form: Form = AS_USUAL) -> 
         found = {name: _array(name, table[name]) for name in known(wanted, list(table))}
     else:
         frame = _frame(table)
-        found = {name: _of_frame(name, frame[name]) for name in known(wanted, frame.columns)}
+        columns = {name: frame[name] for name in known(wanted, frame.columns)}
+        arrow = frame.implementation.is_pyarrow()
+        found = {name: as_numpy(name, x.to_native()) if arrow else x.to_numpy() for name, x in columns.items()}
     lengths = {len(column) if column.ndim in (1, 2) else -1 for column in found.values()}
     if len(lengths) != 1 or not lengths - {-1, 0}:
         shapes = ", ".join(f"{name} {column.shape}" for name, column in found.items())
@@ -130,7 +130,7 @@ def numbers(columns: Columns, name: str) -> np.ndarray:
     if column.dtype.kind == "O":
         others = [k for k, entry in enumerate(column) if not _is_number(entry)]
         # One word makes text of a whole column of a file; the row to repair is its own.
-        words = (k for k in others if not _reads_as_number(column[k]))
+        words = (k for k in others if not (isinstance(column[k], str) and _converts(column[k])))
         row = next(words, others[0] if others else None)
     if row is not None:
         remedy = _remedy(column[row]) or "repair or drop it"
@@ -215,11 +215,6 @@ def _frame(table: Any) -> Any:
         ) from None
 
 
-def _of_frame(name: str, column: Any) -> np.ndarray:
-    """A column of narwhals' as NumPy's."""
-    return as_numpy(name, column.to_native()) if column.implementation.is_pyarrow() else column.to_numpy()
-
-
 def needs(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
@@ -255,17 +250,13 @@ def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
     needs("pyarrow")
     table = None if path.suffix.lower() in PARQUET else _read_csv(path, form)
     names = names_in(path) if table is None else table.column_names
-    _refuse_twice(path, names)
+    twice = [name for name, times in Counter(names).items() if times > 1]
+    if twice:
+        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
     if wanted is None:
         return dict.fromkeys(names, np.zeros(0))
     known(wanted, names)
     return read_parquet([path], wanted) if table is None else {name: table.column(name).to_numpy() for name in wanted}
-
-
-def _refuse_twice(path: Path, names: list[str]) -> None:
-    twice = [name for name, times in Counter(names).items() if times > 1]
-    if twice:
-        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
 
 
 def _read_csv(path: Path, form: Form) -> Any:
@@ -295,19 +286,50 @@ def _read_csv(path: Path, form: Form) -> Any:
     )
 
 
-def _reads_as_number(entry: Any) -> bool:
+def _is_number(entry: Any) -> bool:
+    return isinstance(entry, Number) and not isinstance(entry, complex | np.complexfloating) and _converts(entry)
+
+
+def _converts(entry: Any) -> bool:
+    """Whether a number can be made of it, which an integer may be too large for."""
     try:
         float(entry)
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return isinstance(entry, str)
-
-
-def _is_number(entry: Any) -> bool:
-    if not isinstance(entry, Number) or isinstance(entry, complex | np.complexfloating):
-        return False
-    try:
-        float(entry)  # pyright: ignore[reportArgumentType]
     except (OverflowError, TypeError, ValueError):
         return False
     return True
+
+
+# --- lists ---
+def stacked(name: str, column: np.ndarray) -> np.ndarray | None:
+    """(M, entries) of a column of lists, all of one length; None of any other column."""
+    if column.ndim == 2:
+        return column
+    if column.dtype.kind != "O" or not any(_is_list(entry) for entry in column):
+        return None
+    length = next(len(entry) for entry in column if _is_list(entry))
+    for row, entry in enumerate(column):
+        if not _is_list(entry) or len(entry) != length or any(_is_list(inner) for inner in entry):
+            raise StoreError(
+                f"row {row}: {name} is no list of {length} numbers as in the rows before; drop the row, or mend it."
+            )
+    if not 0 < length <= LONGEST:
+        raise UserError(f"{name} holds lists of {length} entries, from 1 to {LONGEST} can be read; leave it out.")
+    rows = np.array([list(entry) for entry in column], object)
+    try:
+        return rows.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return rows  # whoever reads its numbers refuses the first that is none, by its row
+
+
+def by_entry(name: str, rows: np.ndarray, names: Sequence[str] | None) -> Columns:
+    """Columns (M,) of lists (M, entries) by the names of their entries, counted where they have none."""
+    length = rows.shape[1]
+    if names is not None and len(names) != length:
+        raise StoreError(
+            f"{name} holds lists of {length}, and meta/info.json names {len(names)} entries; mend one of them."
+        )
+    return dict(zip(names if names is not None else map(str, range(length)), rows.T))
+
+
+def _is_list(entry: object) -> bool:
+    return isinstance(entry, list | tuple) or (isinstance(entry, np.ndarray) and entry.ndim == 1)

@@ -8,11 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from ringfence.errors import StoreError
-from ringfence.logs.io.table_schema import AXES, TableSchema
-from ringfence.logs.io.tracks import Tracks, cut, nearest, teams
+from ringfence.logs.io.table_schema import TableSchema
+from ringfence.logs.io.tracks import Tracks, cut, is_first, nearest, teams
+from ringfence.problem.entries import SPACE
 from ringfence.problem.others import others
 
-RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in AXES)
+RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +44,12 @@ class Motion:
         )
 
     def _slope(self, axis: str) -> np.ndarray:
-        segment = self.tracks.segment
-        begins = np.ones(len(segment), bool)
-        begins[1:] = segment[1:] != segment[:-1]
+        first = is_first(self.tracks.segment)
         column = self.column(axis)
         change = np.diff(column, prepend=column[:1]) / self.tracks.dt
         later = np.append(change[1:], 0.0)
-        single = begins & np.append(begins[1:], True)
-        return np.where(single, 0.0, np.where(begins, later, change))
+        single = first & np.append(first[1:], True)
+        return np.where(single, 0.0, np.where(first, later, change))
 
     def accelerations(self, rows: np.ndarray) -> np.ndarray:
         """(W, N, axes) m/s², of windows' rows; what follows the last row of a window is nobody's."""

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, reading, unknown
-from ringfence.logs.io.columns import Columns, Table, known, needs, numbers
-from ringfence.logs.io.lists import stacked
-from ringfence.logs.io.parquet import names_in, read_parquet
+from ringfence.errors import StoreError, UserError, one_of, reading
+from ringfence.logs.io.columns import Columns, Table, by_entry, known, needs, numbers, stacked
+from ringfence.logs.io.formats import names_in, read_parquet
+from ringfence.utils import schemas
 from ringfence.utils.natural import natural
 
 INFO = "meta/info.json"
@@ -50,12 +50,11 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     info = read_info(folder / INFO)
     wanted = [*state, ACTION]
     for name in wanted:
-        if name not in info.names:
-            raise unknown("column of the data set", name, info.names)
+        one_of("column of the data set", name, info.names)
     reward = [REWARD] if REWARD in info.names else []
     read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward])
-    single = {name: next(iter(_by_entry(name, read[name], None).values())) for name in read if name not in wanted}
-    own = {name: _by_entry(name, read[name], info.names[name]) for name in wanted}
+    single = {name: next(iter(_entries(name, read[name], None).values())) for name in read if name not in wanted}
+    own = {name: _entries(name, read[name], info.names[name]) for name in wanted}
     states = _joined(own, state)
     actions = own[ACTION]
     agents = _agents(arms, list(actions))
@@ -85,9 +84,7 @@ def read_info(file: Path) -> Info:
     if not file.is_file():
         raise StoreError(f"'{file.parent.parent}' holds no {INFO}, so it is no LeRobot data set; give its folder.")
     with reading(file, "info.json that LeRobot writes"):
-        if file.stat().st_size > LARGEST:
-            raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
-        info = json.loads(file.read_bytes())
+        info = json.loads(schemas.content(file, LARGEST))
         version = str(info["codebase_version"])
         fps = float(info["fps"])
         features = {str(name): _feature_names(feature) for name, feature in info["features"].items()}
@@ -140,15 +137,10 @@ def _read_files(folder: Path, wanted: list[str]) -> Columns:
     return read_parquet(files, wanted)
 
 
-def _by_entry(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
-    """A column of lists by the names of its entries, counted where they have none; numbers are lists of one."""
+def _entries(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
+    """A column of lists by the names of its entries; numbers are lists of one."""
     rows = stacked(name, column)
-    rows = column[:, None] if rows is None else rows
-    length = rows.shape[1]
-    if names is not None and len(names) != length:
-        raise StoreError(f"{name} holds lists of {length}, and {INFO} names {len(names)} entries; mend one of them.")
-    whose = names if names is not None else [str(k) for k in range(length)]
-    return dict(zip(whose, rows.T))
+    return by_entry(name, column[:, None] if rows is None else rows, names)
 
 
 def _joined(own: Mapping[str, Columns], state: Sequence[str]) -> Columns:

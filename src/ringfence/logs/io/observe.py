@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError
-from ringfence.logs.io.angles import angle_of
-from ringfence.logs.io.table_schema import AXES
 from ringfence.logs.io.tracks import Tracks, nearest
+from ringfence.logs.io.units import angle_of
 from ringfence.logs.schema import GivenCard, StoreCard
-from ringfence.problem.entries import Entries, Entry
+from ringfence.problem.entries import SPACE, Entries, Entry
 from ringfence.problem.others import others
 from ringfence.utils.given import given_as, refuse_other_order
 
@@ -84,7 +83,7 @@ class _Now:
         """(N,) the others' column; nobody is as far along the first axis as one senses."""
         own = self.columns[column]
         theirs = own[who] - own if relative else own[who]
-        first_axis = next((axis for axis in AXES if axis in self.columns), None)
+        first_axis = next((axis for axis in SPACE if axis in self.columns), None)
         return np.where(who >= 0, theirs, self.sensing_radius if column == first_axis else 0.0)
 
 
@@ -96,6 +95,6 @@ def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots
             raise UserError(f"state tells of {n} agents, the logs of {slots + 1}; give all of them.")
         return others(n)
     zero = np.zeros(n, int)
-    place = np.stack([columns[axis] for axis in AXES if axis in columns], 1)
+    place = np.stack([columns[axis] for axis in SPACE if axis in columns], 1)
     now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, zero > 0, card.get("dt", 1.0))
     return nearest(now, place, slots, float(card.get("sensing_radius", np.inf)))

@@ -88,30 +88,19 @@ def read_bag(
         raise UserError(f"twist='{twist}' is unknown; choose child (the robot's frame, ROS's rule) or world.")
     with opened(path) as bag:
         asked = _asked_of(bag, _prefixes(bag, agents, odom), odom, cmd, joints, cost)
-        topics = bag.read({one.topics[role]: role for role in ROLES for one in asked if role in one.topics})
+        topics = bag.read({own[role]: role for role in ROLES for _, own in asked if role in own})
         start = bag.start(topics)
-    robots = [_Robot.of(one, topics) for one in asked]
+    robots = [_Robot(name, **{role: topics[topic] for role, topic in own.items()}) for name, own in asked]
     notes: list[str] = []
-    clock = _clock_of(path, robots, topics, start, stamps, notes)
+    clock = _clock(path, robots, topics, start, stamps, notes)
     return _table(path, robots, clock, twist, notes)
-
-
-def _clock_of(
-    path: Path, robots: list[_Robot], topics: dict[str, Topic], start: int, stamps: bool, notes: list[str]
-) -> Clock:
-    """The clock of all robots' rows, who must agree on frames and kinds of poses."""
-    odometry = [robot.odom for robot in robots]
-    poses = {topic.name for topic in odometry}
-    others = [topic for name, topic in topics.items() if name not in poses]
-    clock = _clock(path, odometry, others, start, stamps, notes)
-    _frames(odometry, notes)
-    _refuse_two_kinds(path, odometry)
-    _refuse_two_commands(path, robots)
-    return clock
 
 
 def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: list[str]) -> Bag:
     """All robots' rows, one robot after another, and which columns are natural as state and action."""
+    _frames([robot.odom for robot in robots], notes)
+    _refuse_two_kinds(path, [robot.odom for robot in robots])
+    _refuse_two_commands(path, robots)
     parts = [_columns_of(path, robot, clock, twist, notes) for robot in robots]
     _refuse_other_joints(path, robots, parts)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in ("time", *parts[0])}
@@ -127,35 +116,22 @@ def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: li
 
 
 # --- agents ---
-@dataclass(frozen=True)
-class _Asked:
-    """An agent's name, and its topics' names by role."""
-
-    name: str
-    topics: dict[str, str]
-
-
 @dataclass(frozen=True, eq=False)
 class _Robot:
     """An agent and its messages."""
 
     name: str
     odom: Topic
-    cmd: Topic | None
-    joints: Topic | None
-    cost: Topic | None
-
-    @classmethod
-    def of(cls, asked: _Asked, topics: dict[str, Topic]) -> _Robot:
-        own = {role: topics[name] for role, name in asked.topics.items()}
-        return cls(asked.name, own["odom"], own.get("cmd"), own.get("joints"), own.get("cost"))
+    cmd: Topic | None = None
+    joints: Topic | None = None
+    cost: Topic | None = None
 
 
 def _asked_of(
     bag: BagFile, prefixes: list[str], odom: str, cmd: str | None, joints: str | None, cost: str | None
-) -> list[_Asked]:
-    """What is to be read of every agent; one with poses and without commands, which others have, is refused by its
-    name."""
+) -> list[tuple[str, dict[str, str]]]:
+    """Every agent's name, and its topics by role; one with poses and without commands, which others have, is refused by
+    its name."""
     if cmd is None and any(joined(prefix, CMD) in bag.topics for prefix in prefixes):
         cmd = CMD
     costs = [] if cost is None else _cost_topics(bag, prefixes, cost)
@@ -175,7 +151,7 @@ def _asked_of(
             topics["cost"] = costs[k]
         if len(set(topics.values())) < len(topics):
             raise UserError(f"odom, cmd, joints and cost of '{name}' name one topic twice; each needs one of its own.")
-        found.append(_Asked(name, topics))
+        found.append((name, topics))
     return found
 
 
@@ -225,9 +201,13 @@ class Clock:
         return self.times[rows.name], self.times[other.name]
 
 
-def _clock(path: Path, odometry: list[Topic], others: list[Topic], start: int, stamps: bool, notes: list[str]) -> Clock:
+def _clock(
+    path: Path, robots: list[_Robot], read: dict[str, Topic], start: int, stamps: bool, notes: list[str]
+) -> Clock:
     """Times of all topics; refuses clocks that disagree and times that go backwards."""
-    topics = [*odometry, *others]
+    odometry = [robot.odom for robot in robots]
+    poses = {topic.name for topic in odometry}
+    topics = [*odometry, *(topic for name, topic in read.items() if name not in poses)]
     stamped = {t.name: t.stamps for t in topics if stamps and t.stamps is not None and t.stamps.any()}
     lags = {t.name: _lag(t, stamped.get(t.name)) for t in topics}
     lead = next((t.name for t in odometry if t.name in stamped), odometry[0].name)

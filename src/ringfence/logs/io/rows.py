@@ -1,14 +1,14 @@
-"""Rows of a table in order, their numbers, and what is doubtful about them."""
+"""Rows of a table in order, their numbers, what is doubtful about them, and the rows in two parts by time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ringfence.errors import StoreError
+from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.utils.natural import numbered
@@ -143,13 +143,7 @@ def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
     """A column of commands, whose last entry of each agent nobody follows: one that is missing is the one before."""
     last = np.flatnonzero(np.append(~rows.follows, True))
     last = last[last > 0]
-    here, before = rows.order[last], rows.order[last - 1]
-    missing = np.array([is_missing(entry) for entry in column[here]], bool)
-    if not missing.any():
-        return column
-    filled = column.copy()
-    filled[here[missing]] = column[before[missing]]
-    return filled
+    return _filled(column, rows.order[last], column[rows.order[last - 1]])
 
 
 def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
@@ -157,11 +151,16 @@ def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
     if column.dtype.kind not in "fO":  # no other has a missing number
         return column
     first = rows.order[np.append(True, ~rows.follows)]
-    missing = np.array([is_missing(entry) for entry in column[first]], bool)
+    return _filled(column, first, np.zeros(len(first), int))
+
+
+def _filled(column: np.ndarray, where: np.ndarray, instead: np.ndarray) -> np.ndarray:
+    """The column with what is `instead` (K,) of those of its rows `where` (K,) that are missing."""
+    missing = np.array([is_missing(entry) for entry in column[where]], bool)
     if not missing.any():
         return column
     filled = column.copy()
-    filled[first[missing]] = 0
+    filled[where[missing]] = instead[missing]
     return filled
 
 
@@ -238,14 +237,10 @@ def doubts(rows: Rows, values: Values, dt: float, schema: TableSchema) -> Iterat
         yield "state holds no x, y or z, so nobody sees where others are relative to oneself"
 
 
-def _moved(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
-    """(M-1, axes of the position) m/s since the row before; 0 where another agent's rows begin."""
-    passed = np.where(rows.follows, np.diff(rows.time), np.inf)
-    return np.diff(values.stacked(schema.position), axis=0) / passed[:, None]
-
-
 def _speeds(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
-    return np.linalg.norm(_moved(rows, values, schema), axis=1)
+    """(M-1,) m/s since the row before; 0 where another agent's rows begin."""
+    passed = np.where(rows.follows, np.diff(rows.time), np.inf)
+    return np.linalg.norm(np.diff(values.stacked(schema.position), axis=0) / passed[:, None], axis=1)
 
 
 def blurred(rows: Rows, values: Values) -> Iterator[str]:
@@ -316,3 +311,43 @@ def _large_actions(values: Values, schema: TableSchema) -> Iterator[str]:
         yield (
             f"the largest action is {largest:.4g}, 99 % are below {usual:.4g}: all are learned in units of the largest"
         )
+
+
+# --- two parts: to learn by and to judge by ---
+def parted(rows: Rows, values: Values, share: float) -> tuple[Rows, Values]:
+    """The rows with each part as recordings of its own, those of the first `share` of the rows in front, so that no
+    episode is of both. Recordings whose times overlap count from a start of their own: these stay whole and are parted
+    in the order of the table."""
+    if not (isinstance(share, int | float) and 0 < share < 1):
+        raise UserError(f"split={share!r:.60} must be a number between 0 and 1: the share of the time to learn by.")
+    late = _late_recordings(rows, share) if _overlap(rows) else rows.time > np.quantile(rows.time, share)
+    if late.all() or not late.any():
+        raise StoreError(
+            f"split={share:g} leaves one part without rows: the recordings count their own times, and there is one "
+            "that holds most rows; give another share."
+        )
+    recording = rows.recording + late * (rows.recording.max() + 1)
+    order = np.lexsort((np.arange(len(late)), rows.agent, recording))
+    part = replace(rows.chosen(order), recording=recording[order])
+    return part, values.chosen(order)
+
+
+def _overlap(rows: Rows) -> bool:
+    """Whether some recording begins before the one that began before it has ended."""
+    begins = np.full(rows.recording.max() + 1, np.inf)
+    ends = np.full(len(begins), -np.inf)
+    np.minimum.at(begins, rows.recording, rows.time)
+    np.maximum.at(ends, rows.recording, rows.time)
+    order = np.argsort(begins, kind="stable")
+    return bool((begins[order][1:] < ends[order][:-1]).any())
+
+
+def _late_recordings(rows: Rows, share: float) -> np.ndarray:
+    """(M,) whether a row's recording ends after the first `share` of the rows, recordings in the order of the table."""
+    count = np.bincount(rows.recording)
+    first = np.full(len(count), len(rows.order))
+    np.minimum.at(first, rows.recording, rows.order)
+    order = np.argsort(first, kind="stable")
+    before = np.empty(len(count))
+    before[order] = np.cumsum(count[order])
+    return (before > share * len(rows.order) + 0.5)[rows.recording]

@@ -15,37 +15,36 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, of_kind, one_of
-from ringfence.logs.io.angles import without_angles
-from ringfence.logs.io.clock import Clock, clock_of, off_the_clock, on_whole_steps
 from ringfence.logs.io.columns import (
     Columns,
     Form,
     Table,
     Tables,
+    by_entry,
     dates,
     names_of,
     numbers,
     read_columns,
     seconds,
+    stacked,
     words,
 )
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
-from ringfence.logs.io.lists import expanded
-from ringfence.logs.io.parts import parted
 from ringfence.logs.io.rows import (
     Rows,
     Values,
     blurred,
     doubts,
+    parted,
     refuse_jumps,
     sorted_rows,
     values_of,
     without_jumps,
 )
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.logs.io.tracks import Tracks, resample
-from ringfence.logs.io.units import in_metres
+from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample
+from ringfence.logs.io.units import in_metres, without_angles
 from ringfence.logs.io.wide import read_wide
 from ringfence.problem.constraints import CostColumn
 
@@ -96,30 +95,19 @@ def read_table(
     table. `card` adds fields to it; its `constraints` holds the limits of several costs (0 by default). `StoreError`
     names the first row that cannot be (counted from 0, without a header).
     """
-    return _read(table, schema, notes, card)[0]
+    return read_parts(table, schema, None, notes=notes, card=card)[0]
 
 
 def read_parts(
     table: Tables,
     schema: TableSchema,
-    share: float,
+    share: float | None,
     *,
     notes: Sequence[str] = (),
     card: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], int]:
     """The same, and how many of the episodes are of the first `share` of the time: these come first, and none is of
-    both parts."""
-    return _read(table, schema, notes, card, share)
-
-
-def _read(
-    table: Tables,
-    schema: TableSchema,
-    notes: Sequence[str],
-    card: Mapping[str, Any] | None,
-    share: float | None = None,
-) -> tuple[dict[str, Any], int]:
-    """What `from_steps` takes, and how many episodes are of the first `share` of the time."""
+    both parts. Without a share, all of the time is one part."""
     of_kind("card", card, Mapping | None, "give a dictionary of its fields")
     of_kind("notes", notes, Sequence, "give a list of sentences")
     columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])
@@ -233,7 +221,29 @@ def _columns_of(table: Table, schema: TableSchema, number: int) -> tuple[Columns
         columns[schema.agent] = _after_the_table(table, columns, schema, number)
     columns[schema.time] = dates(columns[schema.time], schema.time_format)
     names = entry_names(table)
-    return expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
+    return _expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
+
+
+def _expanded(
+    columns: Columns, schema: TableSchema, names: Mapping[str, Sequence[str] | None]
+) -> tuple[Columns, TableSchema]:
+    """The columns, and the schema that names entries instead of lists: `names` has those of a column's entries by the
+    column's name; entries without names are counted (`action.0`). They may be renamed, too."""
+    found = dict(columns)
+    fields: dict[str, tuple[str, ...]] = {}
+    for field in ("state", "action", "goal", "cost"):
+        inner: list[str] = []
+        for column in getattr(schema, field):
+            rows = stacked(column, columns[column])
+            entries = {column: columns[column]}
+            if rows is not None:
+                lists = by_entry(column, rows, names.get(column))
+                entries = {f"{column}.{entry}": values for entry, values in lists.items()}
+            entries = {schema.rename.get(name, name): values for name, values in entries.items()}
+            found |= entries
+            inner += entries
+        fields[field] = tuple(inner)
+    return found, replace(schema, **fields)
 
 
 def _after_the_table(table: Table, columns: Columns, schema: TableSchema, number: int) -> np.ndarray:

@@ -12,8 +12,8 @@ from ringfence.errors import UserError, unknown, whole_number
 from ringfence.logs.io.table_options import Columns, EpisodeRules, Written
 from ringfence.logs.schema import FIELDS as CARD_FIELDS
 from ringfence.problem.constraints import Hazard, Separation
+from ringfence.problem.entries import SPACE
 
-AXES = "xyz"
 LARGEST = 1e15  # number of a schema
 LISTS = ("state", "action", "goal", "cost", "header")
 PROJECTIONS = ("utm", "none")
@@ -81,16 +81,16 @@ class TableSchema(Columns, EpisodeRules, Written):
 
     @property
     def position(self) -> tuple[str, ...]:
-        return tuple(axis for axis in AXES if axis in self.state)
+        return tuple(axis for axis in SPACE if axis in self.state)
 
     @property
     def velocity(self) -> tuple[str, ...]:
-        return tuple(f"v{axis}" for axis in AXES if f"v{axis}" in self.state)
+        return tuple(f"v{axis}" for axis in SPACE if f"v{axis}" in self.state)
 
     @property
     def axes(self) -> tuple[str, ...]:
         """Those that agents move along, by position or velocity."""
-        return tuple(axis for axis in AXES if axis in self.position or f"v{axis}" in self.velocity)
+        return tuple(axis for axis in SPACE if axis in self.position or f"v{axis}" in self.velocity)
 
     @property
     def homogeneous(self) -> bool:
@@ -147,79 +147,45 @@ def _words(schema: TableSchema) -> None:
         _require_word("rename", ours)
 
 
-def _one_kind_of_episode(schema: TableSchema) -> None:
+def _episodes(schema: TableSchema) -> None:
     if schema.team is not None and schema.neighbours is not None:
         raise UserError("team and neighbours both say who an episode is of; give one of them.")
-
-
-def _whole_numbers(schema: TableSchema) -> None:
     for name in ("team", "neighbours", "max_episode_steps"):
         value = getattr(schema, name)
         if value is not None:
             whole_number(name, value, 1, 1000 if name == "neighbours" else 10**6)
     whole_number("min_episode_steps", schema.min_episode_steps, 1)
-
-
-def _episode_steps(schema: TableSchema) -> None:
     most = schema.max_episode_steps
     fewest = schema.min_episode_steps
     if most is not None and most < fewest:
         raise UserError(
             f"max_episode_steps={most} is less than min_episode_steps={fewest}; give a smaller min_episode_steps, too."
         )
-
-
-def _numbers_above_zero(schema: TableSchema) -> None:
     for name in ("time_unit", "dt", "gap", "sensing_radius", "max_speed"):
         value = getattr(schema, name)
         if value is not None and not (isinstance(value, int | float) and 0 < value <= LARGEST):
             raise UserError(f"{name}={value!r:.60} must be a number above 0, and at most {LARGEST:g}.")
 
 
-def _state(schema: TableSchema) -> None:
+def _state_and_goal(schema: TableSchema) -> None:
     if not schema.state:
         raise UserError("state names no column; name those that say where an agent is and how it moves.")
-
-
-def _goal(schema: TableSchema) -> None:
     if schema.goal and len(schema.goal) != len(schema.position):
         raise UserError(
             f"goal names {len(schema.goal)} columns, the position has {len(schema.position)}; state must hold as many "
             "of x, y, z, under these names."
         )
-
-
-def _position(schema: TableSchema) -> None:
     if (schema.homogeneous or schema.danger is not None) and not schema.position:
         raise UserError("state holds no x, y or z, which neighbours and distances follow from; rename these columns.")
 
 
-def _danger(schema: TableSchema) -> None:
-    if schema.danger is None:
-        return
-    if not isinstance(schema.danger, Separation):
+def _danger_and_action(schema: TableSchema) -> None:
+    if schema.danger is not None and not isinstance(schema.danger, Separation):
         raise UserError(
             f"danger={type(schema.danger).__name__} is not read from a table; give a Separation or a cost column."
         )
-    if schema.cost:
+    if schema.danger is not None and schema.cost:
         raise UserError("cost and danger both say what a step costs; give one of them.")
-
-
-def _rename(schema: TableSchema) -> None:
-    ours = list(schema.rename.values())
-    twice = [name for name in ours if ours.count(name) > 1]
-    if twice:
-        raise UserError(f"rename calls two columns '{twice[0]}'; give each a name of its own.")
-
-
-def _wide(schema: TableSchema) -> None:
-    if schema.wide is not None and not (schema.wide.count("{agent}") == schema.wide.count("{column}") == 1):
-        raise UserError(
-            f"wide='{schema.wide}' must hold {{agent}} and {{column}} once; write it as '{{agent}}_{{column}}'."
-        )
-
-
-def _action(schema: TableSchema) -> None:
     if not schema.action and not schema.axes:
         raise UserError(
             "action names no column, and state holds no x or vx to tell accelerations by; name the actions."
@@ -227,14 +193,19 @@ def _action(schema: TableSchema) -> None:
 
 
 def _written(schema: TableSchema) -> None:
+    ours = list(schema.rename.values())
+    twice = [name for name in ours if ours.count(name) > 1]
+    if twice:
+        raise UserError(f"rename calls two columns '{twice[0]}'; give each a name of its own.")
+    if schema.wide is not None and not (schema.wide.count("{agent}") == schema.wide.count("{column}") == 1):
+        raise UserError(
+            f"wide='{schema.wide}' must hold {{agent}} and {{column}} once; write it as '{{agent}}_{{column}}'."
+        )
     if schema.decimal not in (".", ","):
         raise UserError(f"decimal={schema.decimal!r:.60} is no decimal point; give '.' or ','.")
     for name in ("sort", "join"):
         if not isinstance(getattr(schema, name), bool):
             raise UserError(f"{name}={getattr(schema, name)!r:.60} is no choice; give True or False.")
-
-
-def _scale(schema: TableSchema) -> None:
     if not isinstance(schema.scale, Mapping):
         raise UserError(f"scale={schema.scale!r:.60} is no dictionary; give factors by the names of columns.")
     for name, factor in schema.scale.items():
@@ -262,18 +233,9 @@ def _project(schema: TableSchema) -> None:
 
 RULES: tuple[Callable[[TableSchema], None], ...] = (
     _words,
-    _one_kind_of_episode,
-    _whole_numbers,
-    _episode_steps,
-    _numbers_above_zero,
-    _state,
-    _goal,
-    _position,
-    _danger,
-    _action,
-    _rename,
-    _wide,
+    _episodes,
+    _state_and_goal,
+    _danger_and_action,
     _written,
-    _scale,
     _project,
 )

@@ -1,22 +1,129 @@
 """Rows of (time, agent) as episodes: one clock, holes cut, a constant team or an agent among its neighbours.
 
-Everything here is NumPy on flat arrays; `rows.py` says what a table's rows are, `episodes.py` what agents see.
+Tracks are NumPy on flat arrays; `rows.py` says what a table's rows are, `episodes.py` what agents see.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ringfence.errors import StoreError
+from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.rows import Rows
+from ringfence.logs.io.table_schema import TableSchema
 
+GAP = 5.0  # steps without a row that end an episode
+EXACT = 0.05  # of a step, by which a round number of seconds or hertz may be off at a recording's end
+DIGITS = 1e-5  # of a step, which six digits leave open
+CLOSE = 0.01  # of a step, within which another is meant to be the same
+NEAR = 10  # rows before and after, whose phase is one
+COHERENT = 0.3  # length of the mean phase of rows that share a clock, nearly everywhere; 0 of rows at random times
+SLIPS = 0.25  # of a step, above which rows are put on whole steps
+OFF = 0.01  # of a step, above which it is said
 FINEST = 1000  # steps between two rows: more are another unit of time
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 STEADY = 0.5  # length of the mean phase of rows that keep their place between steps
 CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
 
 
+# --- the clock: how long a step is; rows whose clock drifts or begins late ---
+@dataclass(frozen=True)
+class Clock:
+    """Steps that rows are put on."""
+
+    dt: float  # s
+    gap: float  # s without a row, after which an agent was away
+
+
+def clock_of(rows: Rows, schema: TableSchema) -> Clock:
+    """The steps that the schema asks for, or those of the rows."""
+    dt = schema.dt or _step(rows)
+    gap = schema.gap or GAP * max(dt, rows.step)
+    if gap < rows.step:
+        raise UserError(
+            f"gap={gap:g} is less than the {rows.step:g} s between an agent's rows; every row would be cut off."
+        )
+    return Clock(dt, gap)
+
+
+def _step(rows: Rows) -> float:
+    """s between an agent's rows: the median with six digits, or what is near whole hertz, where nothing slips by that
+    until the longest recording ends; else the mean over whole numbers of steps, which the digits of no time blur."""
+    track = np.cumsum(np.append(True, ~rows.follows))
+    lag = min(NEAR, int(np.bincount(track).max()) - 1)
+    passed = (rows.time[lag:] - rows.time[:-lag])[track[lag:] == track[:-lag]]
+    passed = passed[passed <= GAP * lag * rows.step]
+    mean = rows.step
+    for _ in range(3):  # a better one counts better
+        mean = float(passed.sum() / max(np.round(passed / mean).sum(), 1))
+    if abs(mean / rows.step - 1) > CLOSE:  # no clock
+        return float(f"{rows.step:.6g}")
+    hertz = 1 / max(round(1 / mean), 1)
+    nice = [float(f"{rows.step:.6g}"), hertz, float(f"{mean:.6g}")]
+    if abs(hertz / rows.step - 1) < DIGITS:
+        nice.insert(0, hertz)
+    begins = np.flatnonzero(is_first(rows.recording))
+    spans = np.maximum.reduceat(rows.time, begins) - np.minimum.reduceat(rows.time, begins)  # of each recording
+    longest = float(spans.max())
+    return next((step for step in nice if abs(step / mean - 1) * longest <= EXACT * step), mean)
+
+
+# --- drift ---
+def on_whole_steps(rows: Rows, clock: Clock) -> tuple[Rows, list[str]]:
+    """The rows with times from 0 in each recording. Where a clock drifts or its first row comes late, so that rows
+    would slip by more than a quarter of a step, steps are counted by rows, and a sentence says how far it drifted."""
+    spacing = _spacing(clock.dt, rows.step)
+    time = rows.time.copy()
+    begins = np.flatnonzero(is_first(rows.recording))
+    furthest = 0.0
+    for here in (slice(*ends) for ends in zip(begins, [*begins[1:], len(time)])):
+        time[here] -= time[here].min()
+        steps = time[here] / clock.dt
+        if spacing is None or float(np.abs(steps - np.round(steps)).max()) <= SLIPS:
+            continue
+        slip = _slip(time[here], rows.agent[here], spacing)
+        if slip is not None and float(np.abs(slip).max()) * spacing > SLIPS * clock.dt:
+            furthest = max(furthest, float(np.ptp(slip)) * spacing / clock.dt)
+            time[here] = np.where(time[here] == 0, 0, time[here] - slip * spacing)
+    said = f"a clock drifts by up to {furthest:.3g} steps of {clock.dt:g} s: steps are counted by rows"
+    return replace(rows, time=time), [said] if furthest > SLIPS else []
+
+
+def _spacing(dt: float, step: float) -> float | None:
+    """s between rows of which `dt` is a whole number, or a whole part of one: what is near the rows' own `step`."""
+    many = round(max(dt / step, step / dt))
+    spacing = dt / many if dt >= step else dt * many
+    return spacing if abs(spacing / step - 1) < CLOSE else None
+
+
+def _slip(time: np.ndarray, agent: np.ndarray, spacing: float) -> np.ndarray | None:
+    """(M,) rows by which times are late against a clock that ticks from 0 every `spacing` s: of all agents, or of the
+    one with most rows where they share no clock. None where that one has none either."""
+    for chosen in (np.ones(len(time), bool), agent == np.bincount(agent).argmax()):
+        some = np.sort(time[chosen])
+        phases = np.concatenate([[0], np.cumsum(np.exp(2j * np.pi / spacing * some))])
+        first = np.searchsorted(some, some - NEAR * spacing, "left")
+        last = np.searchsorted(some, some + NEAR * spacing, "right")
+        mean = (phases[last] - phases[first]) / (last - first)
+        if float(np.quantile(np.abs(mean), 0.05)) > COHERENT:
+            return np.interp(time, some, np.unwrap(np.angle(mean)) / (2 * np.pi))
+    return None
+
+
+def off_the_clock(rows: Rows, clock: Clock) -> Iterator[str]:
+    """A sentence where rows whose times begin at 0 are off the steps."""
+    steps = rows.time / clock.dt
+    far = float(np.quantile(np.abs(steps - np.round(steps)), 0.99))
+    if far > OFF:
+        yield (
+            f"rows are up to {far:.2g} of a step of {clock.dt:g} s off the clock: states are interpolated, actions, "
+            "costs and rewards are those nearest to a step"
+        )
+
+
+# --- tracks ---
 @dataclass(frozen=True)
 class Tracks:
     """R rows on one clock, sorted by segment and step: a segment is one agent without a hole.
@@ -54,8 +161,7 @@ def resample(
     segments = _Segments.of(recording, agent, time, ended, gap)
     segment, step = segments.grid(dt)
     at, row = segments.placed(segment, step, dt)
-    fresh = np.ones(len(row), bool)
-    fresh[1:] = segment[1:] != segment[:-1]
+    fresh = is_first(segment)
     row = np.where(np.append(fresh[1:], True), segments.last[segment], row)  # what comes after the last step is of it
     before = np.where(fresh, segments.first[segment] - 1, np.concatenate([[0], row[:-1]]))
     return Tracks(
@@ -157,15 +263,23 @@ def _lasting(cost: np.ndarray, own: np.ndarray, fresh: np.ndarray) -> np.ndarray
     return np.where(lasts, cost[here] / np.maximum(here - before, 1)[:, None], cost)
 
 
+def is_first(*keys: np.ndarray) -> np.ndarray:
+    """(M,) whether a row has another of the keys (M,) than the one before; the first row has."""
+    return np.append(True, np.any([key[1:] != key[:-1] for key in keys], 0))
+
+
+def _moments(recording: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(index of the first row of each time, how many rows it has), of rows (M,) in the order of time."""
+    first = np.flatnonzero(is_first(recording, step))
+    return first, np.diff(np.append(first, len(step)))
+
+
 def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int]:
     """Windows in which the same agents are there: rows (W, N) of `tracks`, of everybody at a time; how many rows each
     window has; and N, by default the size that most rows belong to."""
     order = np.lexsort((tracks.agent, tracks.step, tracks.recording))
     recording, step, segment = (x[order] for x in (tracks.recording, tracks.step, tracks.segment))
-    begins = np.ones(len(order), bool)
-    begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
-    first = np.flatnonzero(begins)
-    many = np.diff(np.append(first, len(order)))
+    first, many = _moments(recording, step)
     # Who is there, as one number: two sets of segments share theirs once in 2^64.
     mark = np.random.default_rng(0).integers(0, 2**63, segment.max() + 1, np.uint64, endpoint=True)[segment]
     who = np.add.reduceat(mark, first)
@@ -201,12 +315,7 @@ def cut(rows: np.ndarray, fewest: int, most: int | None) -> tuple[np.ndarray, np
 def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float) -> np.ndarray:
     """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sensing_radius` m."""
     order = np.lexsort((tracks.step, tracks.recording))
-    recording = tracks.recording[order]
-    step = tracks.step[order]
-    begins = np.ones(len(order), bool)
-    begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
-    first = np.flatnonzero(begins)
-    many = np.diff(np.append(first, len(order)))
+    first, many = _moments(tracks.recording[order], tracks.step[order])
     found = np.full((len(order), k), -1)
     by_size = np.argsort(many, kind="stable")  # so that little is padded
     while len(by_size):

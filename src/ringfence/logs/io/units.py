@@ -1,6 +1,9 @@
-"""Units of a table's columns: numbers times a factor, and degrees of longitude and latitude as metres."""
+"""Units of a table's columns: numbers times a factor, degrees of longitude and latitude as metres, and angles as their
+cosine and sine, since an angle jumps by a turn, and between -pi and pi lies no 0."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +19,11 @@ SERIES = (N / 2 - 2 * N**2 / 3 + 5 * N**3 / 16, 13 * N**2 / 48 - 3 * N**3 / 5, 6
 SCALE, EASTING, NORTHING = 0.9996, 500_000.0, 10_000_000.0
 REACH = 9.0  # degrees from a zone's middle, beyond which distances are off by more than a hundredth
 POLES = 84.0  # degrees of latitude, where UTM ends
+
+ANGLES = ("theta", "yaw", "heading", "compass", "course", "bearing", "psi")
+DEGREES = ("_deg", "_degrees")
+RADIANS = ("_rad", "_radians")
+TURN = 2 * np.pi + 1e-6
 
 
 def in_metres(columns: Columns, schema: TableSchema) -> tuple[Columns, list[str]]:
@@ -84,3 +92,49 @@ def utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, north: bool) -> 
 def _middle(zone: int) -> float:
     """Degrees of longitude of a zone's middle."""
     return 6.0 * zone - 183.0
+
+
+# --- angles ---
+def without_angles(columns: Columns, schema: TableSchema) -> tuple[Columns, TableSchema, list[str]]:
+    """The columns and the schema with `cos_yaw` and `sin_yaw` instead of `yaw`, and a note. Angles are known by their
+    names; they are in radians, `compass` and what ends in `_deg` in degrees."""
+    angles = [name for name in schema.state if _plain(name) in ANGLES]
+    if not angles:
+        return columns, schema, []
+    found = dict(columns)
+    for name in angles:
+        angle = _radians(columns, name)
+        found |= {f"cos_{name}": np.cos(angle), f"sin_{name}": np.sin(angle)}
+    state: list[str] = []
+    for name in schema.state:
+        state += [f"cos_{name}", f"sin_{name}"] if name in angles else [name]
+    note = f"angles are observed as cosine and sine, since they jump by a turn: {', '.join(angles)}"
+    return found, replace(schema, state=tuple(state)), [note]
+
+
+def angle_of(name: str, value: np.ndarray) -> np.ndarray:
+    """Radians of an angle of that name."""
+    return np.deg2rad(value) if _in_degrees(name) else value
+
+
+def _radians(columns: Columns, name: str) -> np.ndarray:
+    value = numbers(columns, name)
+    largest = float(np.abs(value).max())
+    if not _in_degrees(name) and not name.endswith(RADIANS) and largest > TURN:
+        raise StoreError(
+            f"{name} reaches {largest:.4g}: if it is in degrees, call it {name}_deg (--rename {name}={name}_deg), "
+            f"if it counts turns in radians, {name}_rad."
+        )
+    return angle_of(name, value)
+
+
+def _in_degrees(name: str) -> bool:
+    return name.endswith(DEGREES) or _plain(name) == "compass"
+
+
+def _plain(name: str) -> str:
+    """The last word of a dotted name, without its unit."""
+    word = name.rpartition(".")[2].lower()
+    for unit in (*DEGREES, *RADIANS):
+        word = word.removesuffix(unit)
+    return word

@@ -31,7 +31,7 @@ def read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str], form
     for name, columns in own.items():
         lacking = [agent for agent in agents if agent not in columns]
         if columns and lacking:
-            column = _written(schema.wide, lacking[0], theirs.get(name, name))
+            column = schema.wide.replace(COLUMN, theirs.get(name, name)).replace(AGENT, lacking[0])
             raise StoreError(
                 f"The agent '{lacking[0]}' has no column '{column}', and "
                 f" '{next(iter(columns))}' has; leave {name} out, or add it."
@@ -49,7 +49,10 @@ def _owners(wide: str, names: Iterable[str], asked: Mapping[str, str]) -> dict[s
     `leadervx` is vx of `leader`, not x of `leaderv`."""
     own: dict[str, dict[str, str]] = {name: {} for name in asked}
     by_length = sorted(asked, key=lambda name: -len(asked[name]))
-    patterns = {name: re.compile(_pattern(wide, asked[name])) for name in by_length}
+    patterns: dict[str, re.Pattern[str]] = {}
+    for name in by_length:
+        before, after = wide.replace(COLUMN, asked[name]).split(AGENT)
+        patterns[name] = re.compile(f"{re.escape(before)}(?P<agent>.+){re.escape(after)}")
     for column in names:
         for name in by_length:
             found = patterns[name].fullmatch(column)
@@ -57,15 +60,6 @@ def _owners(wide: str, names: Iterable[str], asked: Mapping[str, str]) -> dict[s
                 own[name][found["agent"]] = column
                 break
     return own
-
-
-def _pattern(wide: str, column: str) -> str:
-    before, after = wide.replace(COLUMN, column).split(AGENT)
-    return f"{re.escape(before)}(?P<agent>.+){re.escape(after)}"
-
-
-def _written(wide: str, agent: str, column: str) -> str:
-    return wide.replace(COLUMN, column).replace(AGENT, agent)
 
 
 def _of_agent(

@@ -1,4 +1,4 @@
-"""Import OG-MARL's robots (Formanek et al. 2023): Vaults, and the arrays that MADIFF made of the older release.
+"""Read OG-MARL's robots (Formanek et al. 2023): Vaults, and the arrays that MADIFF made of the older release.
 
 Both were recorded with the old multi-agent MuJoCo, whose observations are not those of Safe Multi-Agent MuJoCo; its
 *states* are, up to what follows them. So everything is rebuilt from states:
@@ -18,34 +18,28 @@ Both were recorded with the old multi-agent MuJoCo, whose observations are not t
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from ringfence.datasets.importers import common
-from ringfence.datasets.registry import QUANTILE_LIMITS, ROBOT_COST_LIMIT
-from ringfence.envs import SafeMuJoCo, mujoco
+from ringfence.envs import SafeMuJoCo
 from ringfence.envs.base import Outcome
-from ringfence.envs.mujoco import Parts
-from ringfence.errors import StoreError, UserError, reading, unknown
-from ringfence.logs.store import EpisodeStore
+from ringfence.envs.mujoco import COST_LIMIT
+from ringfence.errors import StoreError, reading
+from ringfence.logs.io.common import inside, without_last_steps
 from ringfence.problem import constraints
 from ringfence.utils.arrays import affordable
 from ringfence.utils.files import read_npy
 
-ROBOTS: dict[str, Parts] = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
-TIERS = ("good", "medium", "poor", "expert", "replay")
 REPLAYED = 256  # steps that are replayed to find the order of actions
 AGREES = 0.05  # median over replayed steps of the largest error in the state; the wrong order has errors of 1 to 10
 STRAY = 1.0  # a replayed step that misses by more is a stray
 STRAYS = 0.05  # the share of them that is allowed
 SPEED_AGREES = 0.1  # m/s, median over replayed steps of the error of the speed that the reward tells
-Limit = float | Literal["quantile"] | None
 VAULT = ("actions", "rewards", "terminals", "truncations", "infos.state")
 RECORDED_WITH = "multiagent_mujoco 1.1, MuJoCo 2.1 (OG-MARL's word; the files do not say)"
 GYMNASIUM_FORCES = 78  # contact forces in the states of gymnasium-robotics' Ant, which leaves out the world's six
@@ -77,44 +71,12 @@ class ObservationLog(Log):
     observations: np.ndarray  # (T, N, O)
 
 
-@dataclass(frozen=True)
-class DataSet:
-    """What a recording is of."""
-
-    env: SafeMuJoCo  # under the data's limit
-    name: str  # of the task
-    protocol: str  # what the limit is
+Made = tuple[dict[str, Any], np.ndarray, str]  # arrays by name, (T,) speed in m/s, what it was recorded with
 
 
-@dataclass(frozen=True)
-class Steps:
-    """What a store is made of; T steps, E episodes."""
-
-    simulator: str  # that it was recorded with
-    observations: np.ndarray  # (T, N, O)
-    actions: np.ndarray  # (T, N, A)
-    rewards: np.ndarray  # (T,)
-    episode_ends: np.ndarray  # (E,)
-    final_observations: np.ndarray  # (E, N, O)
-    terminated: np.ndarray  # (E,) bool
-    speed: np.ndarray  # (T,) m/s
-    speed_names: tuple[str, ...]  # the entries whose norm the speed is
-    names: list[str]  # of an observation's entries
-    state: np.ndarray | None = None  # (T, S)
-    final_state: np.ndarray | None = None  # (E, S)
-
-
-def import_vault(
-    vault: str | os.PathLike, task: str, speed_limit: Limit = None, tier: str | None = None
-) -> EpisodeStore:
-    """The store of a Vault, e.g. `2halfcheetah.vlt/Good`; `task`: halfcheetah_2x3, ant_2x4 or ant_4x2.
-
-    `speed_limit`: safety-gymnasium's (None), that of the tier's `-quantile` task ("quantile"), or any other (m/s).
-    `tier`: a word for the data; the folder's name, where it is good, medium, poor, expert or replay.
-    """
-    vault = Path(vault)
-    data_set = _data_set(task, _tier(vault, tier), speed_limit)
-    env = data_set.env
+def read_vault(vault: Path, env: SafeMuJoCo) -> dict[str, Any]:
+    """What `EpisodeStore.from_steps` takes, of a Vault of the robot `env`, under whose limit costs are; its card has no
+    task."""
     where = f"Vault '{vault}'"
     arrays = _read_vault(vault, VAULT)
     for name in VAULT:
@@ -124,7 +86,7 @@ def import_vault(
             )
     sequences, steps = arrays["actions"].shape[:2]
     _check_shape(where, "actions", arrays["actions"], (sequences, steps, env.n_agents, env.action_dim))
-    states = _vault_states(where, task, env, arrays["infos.state"])
+    states = _vault_states(where, env, arrays["infos.state"])
     width = len(env.state_names)
     for name in ("rewards", "terminals", "truncations"):  # of every agent, or of the team
         if arrays[name].ndim == 2:
@@ -148,30 +110,25 @@ def import_vault(
     notes = []
     if unended:
         notes.append(f"{unended} episodes at the end of a recording have no end of their own and count as cut off")
-    return _store(log, data_set, f"imported from an OG-MARL Vault, '{vault}'", notes)
+    return _steps(log, env, f"imported from an OG-MARL Vault, '{vault}'", notes)
 
 
-def _vault_states(where: str, task: str, env: SafeMuJoCo, states: np.ndarray) -> np.ndarray:
+def _vault_states(where: str, env: SafeMuJoCo, states: np.ndarray) -> np.ndarray:
     """(B, T, S and contact forces); a layout that nobody knows is refused."""
     if states.ndim == 4:
         states = states[:, :, 0]  # some copies repeat them for every agent
     known = (27, 105, 111) if env.ant else (17,)
     if states.ndim != 3 or states.shape[-1] not in known:
         raise StoreError(
-            f"{where} has states of {states.shape[-1]} entries; known layouts of {task} have "
+            f"{where} has states of {states.shape[-1]} entries; known layouts of {env.name} have "
             f"{', '.join(map(str, known))} (positions but the planar place, velocities, contact forces)."
         )
     return states
 
 
-def import_madiff(
-    directory: str | os.PathLike, task: str, speed_limit: Limit = None, tier: str | None = None
-) -> EpisodeStore:
-    """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` and
-    `tier` as of `import_vault`."""
-    directory = Path(directory)
-    data_set = _data_set(task, _tier(directory, tier), speed_limit)
-    env = data_set.env
+def read_madiff(directory: Path, env: SafeMuJoCo) -> dict[str, Any]:
+    """The same of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`. There is no `state`
+    of the Ant."""
     n = env.n_agents
     where = f"'{directory}'"
     observations = _load(directory, "obs")
@@ -199,27 +156,8 @@ def import_madiff(
     last[np.cumsum(lengths) - 1] = True
     provenance = f"imported from MADIFF's arrays in {where}"
     if env.ant:
-        return _store(ObservationLog(where, actions, rewards, last, observations), data_set, provenance, [])
-    state = _cheetah_state(where, observations)
-    return _store(StateLog(where, actions, rewards, last, state), data_set, provenance, [])
-
-
-def _data_set(task: str, tier: str, speed_limit: Limit) -> DataSet:
-    """A robot's data of a tier under a limit: a name stands for one limit."""
-    if task not in ROBOTS:
-        raise unknown("robot", task, ROBOTS)
-    env = SafeMuJoCo(ROBOTS[task])
-    name = f"{task}-{tier}"
-    if speed_limit is None:
-        return DataSet(env, name, "native")
-    if speed_limit == "quantile":
-        if name not in QUANTILE_LIMITS:
-            raise UserError(
-                f"There is no quantile limit for '{name}'; name the tier with --tier good, medium or poor, or pass "
-                "--speed-limit in m/s."
-            )
-        return DataSet(replace(env, speed_limit=QUANTILE_LIMITS[name]), f"{name}-quantile", "quantile")
-    return DataSet(replace(env, speed_limit=float(speed_limit)), f"{name}-below-{speed_limit:g}", "own")
+        return _steps(ObservationLog(where, actions, rewards, last, observations), env, provenance, [])
+    return _steps(StateLog(where, actions, rewards, last, _cheetah_state(where, observations)), env, provenance, [])
 
 
 def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
@@ -232,48 +170,32 @@ def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
     return np.column_stack([z, pitch, position, vx, vz, vpitch, velocity])
 
 
-def _store(log: StateLog | ObservationLog, data_set: DataSet, provenance: str, notes: list[str]) -> EpisodeStore:
-    env = data_set.env
-    arrays: dict[str, np.ndarray | None] = {"actions": log.actions, "rewards": log.rewards}
-    if isinstance(log, StateLog):
-        arrays = {"state": log.state, "contact": log.contact} | arrays
-    else:
-        arrays = {"observations": log.observations} | arrays
-    _check_finite(log.where, arrays)
+def _steps(log: StateLog | ObservationLog, env: SafeMuJoCo, provenance: str, notes: list[str]) -> dict[str, Any]:
+    """What `EpisodeStore.from_steps` takes."""
+    arrays = ("state", "contact", "observations", "actions", "rewards")
+    _check_finite(log.where, {name: getattr(log, name, None) for name in arrays})
     ends = _ends(log, env, notes)
     if isinstance(log, StateLog):
-        steps = _from_states(log, env, ends, notes)
-        task = data_set.name
+        steps, speed, simulator = _from_states(log, env, ends, notes)
+        names, fast = list(env.observation_names), ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)
     else:
-        steps = _from_observations(log, env, ends, notes)
-        task = f"{data_set.name}-observations"
-    short = int((np.diff(ends, prepend=0) < env.episode_length).sum() - steps.terminated.sum())
+        steps, speed, simulator = _from_observations(log, env, ends, notes)
+        names, fast = _old_names(log.observations.shape[2], env), ("torso.vx",)
+    short = int((np.diff(ends, prepend=0) < env.episode_length).sum() - steps["terminated"].sum())
     if env.ant and short:
         notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
-    return EpisodeStore.from_steps(
-        steps.observations,
-        steps.actions,
-        steps.rewards,
-        episode_ends=steps.episode_ends,
-        final_observations=steps.final_observations,
-        costs=steps.speed > env.limit,
-        state=steps.state,
-        final_state=steps.final_state,
-        terminated=steps.terminated,
-        card={
-            "task": task,
-            "simulator": steps.simulator,
-            "provenance": provenance,
-            "agents": [f"agent{i}" for i in range(env.n_agents)],
-            "observation_names": steps.names,
-            "state_names": list(env.state_names) if steps.state is not None else [],
-            "hazard": constraints.to_dict(constraints.SpeedLimit(env.limit, steps.speed_names)),
-            "episode_length": env.episode_length,
-            "warnings": notes,
-            "protocol": data_set.protocol,
-            **env.describe(steps.speed, ROBOT_COST_LIMIT),
-        },
-    )
+    card = {
+        "simulator": simulator,
+        "provenance": provenance,
+        "agents": [f"agent{i}" for i in range(env.n_agents)],
+        "observation_names": names,
+        "state_names": list(env.state_names) if "state" in steps else [],
+        "hazard": constraints.to_dict(constraints.SpeedLimit(env.limit, fast)),
+        "episode_length": env.episode_length,
+        "warnings": notes,
+        **env.describe(speed, COST_LIMIT),
+    }
+    return {**steps, "costs": speed > env.limit, "card": card}
 
 
 def _ends(log: StateLog | ObservationLog, env: SafeMuJoCo, notes: list[str]) -> np.ndarray:
@@ -324,15 +246,13 @@ def _team_rewards(log: Log) -> np.ndarray:
     return log.rewards.astype(np.float64).mean(-1)
 
 
-def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Steps:
+def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Made:
     """Episodes that end with what the simulator says their last action led to."""
     total = int(ends[-1])
     at = ends - 1
     actions = np.clip(log.actions[:total], -1.0, 1.0).astype(np.float64)
     rewards = _team_rewards(log)[:total]
-    inside = np.ones(total, bool)
-    inside[at] = False
-    order, vx = _replay(log, env, actions, np.flatnonzero(inside), notes)
+    order, vx = _replay(log, env, actions, np.flatnonzero(inside(ends)), notes)
     actions = actions[:, :, order]
     outcome, final_state = _one_step(env, log.state[at], actions[at])
     falls = f", in which {int(outcome.terminated.sum())} of {len(ends)} episodes end with a fall" if env.ant else ""
@@ -352,20 +272,17 @@ def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[s
         after[at] = final_state[:, sideways]
         speed = np.hypot(vx, (state[:, sideways] + after) / 2)
     newer = unpaid.any() or (log.contact is not None and log.contact.shape[1] == GYMNASIUM_FORCES)
-    return Steps(
-        simulator="gymnasium-robotics, version not recorded" if newer else RECORDED_WITH,
-        observations=state[:, env.observed],
-        actions=actions,
-        rewards=rewards,
-        episode_ends=ends,
-        final_observations=final_state[:, env.observed],
-        terminated=outcome.terminated,
-        speed=speed,
-        speed_names=("torso.vx", "torso.vy") if env.ant else ("torso.vx",),
-        names=list(env.observation_names),
-        state=state,
-        final_state=final_state,
-    )
+    steps = {
+        "observations": state[:, env.observed],
+        "actions": actions,
+        "rewards": rewards,
+        "episode_ends": ends,
+        "final_observations": final_state[:, env.observed],
+        "terminated": outcome.terminated,
+        "state": state,
+        "final_state": final_state,
+    }
+    return steps, speed, "gymnasium-robotics, version not recorded" if newer else RECORDED_WITH
 
 
 def _unpaid_falls(outcome: Outcome, rewards: np.ndarray) -> np.ndarray:
@@ -375,7 +292,7 @@ def _unpaid_falls(outcome: Outcome, rewards: np.ndarray) -> np.ndarray:
     return outcome.terminated & (np.abs(missing - 1.0) < np.abs(missing))
 
 
-def _from_observations(log: ObservationLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Steps:
+def _from_observations(log: ObservationLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Made:
     """Episodes without states, the last step of each missing."""
     notes += [
         "the last step of every episode was dropped: what it led to is not recorded, and falls are not marked",
@@ -384,25 +301,19 @@ def _from_observations(log: ObservationLog, env: SafeMuJoCo, ends: np.ndarray, n
         "without states nothing could be replayed: rewards and the order of actions are taken as recorded",
     ]
     total = int(ends[-1])
-    lengths = np.diff(ends, prepend=0)
-    keep = np.ones(total, bool)
-    keep[ends - 1] = False
-    if not keep.any():
+    kept, ends, last = without_last_steps(ends)
+    if not len(ends):
         raise StoreError(f"{log.where} holds no episode of two steps or more.")
-    long_enough = lengths > 1
-    observations = log.observations[:total].astype(np.float32)
-    return Steps(
-        simulator=RECORDED_WITH,
-        observations=observations[keep],
-        actions=np.clip(log.actions[:total], -1.0, 1.0)[keep],
-        rewards=_team_rewards(log)[:total][keep],
-        episode_ends=np.cumsum(lengths[long_enough] - 1),
-        final_observations=observations[ends[long_enough] - 1],
-        terminated=np.zeros(int(long_enough.sum()), bool),
-        speed=np.abs(_forward_speed(log, env, total))[keep],
-        speed_names=("torso.vx",),
-        names=_old_names(observations.shape[2], env),
-    )
+    observations = log.observations.astype(np.float32)
+    steps = {
+        "observations": observations[kept],
+        "actions": np.clip(log.actions[kept], -1.0, 1.0),
+        "rewards": _team_rewards(log)[kept],
+        "episode_ends": ends,
+        "final_observations": observations[last],
+        "terminated": np.zeros(len(ends), bool),
+    }
+    return steps, np.abs(_forward_speed(log, env, total))[kept], RECORDED_WITH
 
 
 def _one_step(env: SafeMuJoCo, state: np.ndarray, actions: np.ndarray) -> tuple[Outcome, np.ndarray]:
@@ -492,14 +403,6 @@ def _old_names(width: int, env: SafeMuJoCo) -> list[str]:
     return [f"own{k}" for k in range(own)] + [f"near{k}.q" for k in range(near)] + ["torso.vx", "torso.x"]
 
 
-def _tier(path: Path, given: str | None) -> str:
-    """The word for the data: the one that is given, or the folder's name."""
-    if given:
-        return given.lower() if given.lower() in TIERS else given
-    name = path.resolve().name.lower()
-    return name if name in TIERS else "imported"
-
-
 def _check_shape(where: str, name: str, array: np.ndarray, wanted: tuple[int, ...]) -> None:
     if array.shape != wanted:
         raise StoreError(
@@ -539,7 +442,7 @@ def _read_vault(vault: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
         with reading(vault / name, "array of a Vault", "copy the Vault again"):
             array = tensorstore.open({"driver": "zarr", "kvstore": base}).result()
             array = array if cut is None else array[:, cut]
-            affordable(vault, array.dtype.numpy_dtype.itemsize * array.size, common.PACKED, stored)
+            affordable(vault, array.dtype.numpy_dtype.itemsize * array.size, stored=stored)
             return np.asarray(array.read().result())
 
     steps = int(read("vault_index")[0])

@@ -1,13 +1,12 @@
-"""Import the HDF5 files of single-agent offline reinforcement learning: DSRL's, D4RL's and Minari's. M rows or T steps:
+"""Read the HDF5 files of single-agent offline reinforcement learning: DSRL's, D4RL's and Minari's. M rows or T steps:
 
     DSRL    observations, next_observations (M, ...), actions (M, ...), rewards, costs, terminals, timeouts (M,)
     D4RL    observations, actions, rewards, terminals, timeouts; next_observations in some, and infos/, metadata/
-    Minari  episode_0, episode_1, ..., each with observations (T+1, ...), or a group of them, actions, rewards,
-            terminations, truncations (T,), infos/ (T+1 rows, the first of the reset); metadata.json beside the file
+    Minari  episode_0, episode_1, ..., a group of every episode (`minari.py`)
 
-The names and shapes are those of the repositories liuzuxin/DSRL (`dsrl/offline_env.py`, Liu et al. 2023),
-Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020) and Farama-Foundation/Minari
-(read in `minari.py`). What the files do not say, and is done here:
+The names and shapes are those of the repositories liuzuxin/DSRL (`dsrl/offline_env.py`, Liu et al. 2023) and
+Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020). What the files do not say, and is
+done here:
 
 * the state that an episode's last step led to is in `next_observations` or, with Minari, in the last row. D4RL's files
   without it give up the last step of every episode, whose own observation becomes the last state; since nothing is
@@ -16,26 +15,22 @@ Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 202
   episode and are dropped. Minari's episodes end with their group: one without a mark is truncated;
 * costs are DSRL's `costs` and Minari's `infos/cost`, both of the state that a step leads to. Elsewhere they are 0, and
   the card says that nothing was recorded;
-* the log is one agent's, unless a map of columns shares it out among several (`columns.py`).
+* the log is one agent's, unless a map of columns shares it out among several (`common.py`).
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from ringfence.datasets import registry
-from ringfence.datasets.importers import columns, common, minari
-from ringfence.errors import StoreError, UserError, reading
-from ringfence.logs.schema import complete_card
-from ringfence.logs.store import EpisodeStore
-from ringfence.utils import arrays, schemas
+from ringfence.errors import StoreError, reading
+from ringfence.logs.io import common, minari
+from ringfence.utils import arrays
 
 D4RL = ("observations", "actions", "rewards", "terminals", "timeouts")
 DSRL = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
@@ -47,96 +42,17 @@ STRAYS = 0.05  # of the steps: more of them that do not lead to the next row are
 CHUNK = 50_000  # rows at a time
 
 
-def import_hdf5(
-    path: str | os.PathLike,
-    *,
-    task: str | None = None,
-    agents: dict | str | os.PathLike | None = None,
-    cost_limit: float | None = None,
-    action_low: float | Sequence[float] | None = None,
-    action_high: float | Sequence[float] | None = None,
-) -> EpisodeStore:
-    """The store of a DSRL, D4RL or Minari file, of a folder with Minari's main_data.hdf5, or of a Minari data set that
-    is on this machine, by its name (needs the extra `minari`). The layout is recognised by the names in the file.
-
-    `agents` shares the columns out (see `columns.py`): a dictionary, JSON text or a JSON file's path; one agent by
-    default. `task` defaults to the name of the file or the data set. `cost_limit` is the cost per episode that reports
-    call safe. Actions are bounded by `action_low` and `action_high`, one number for all entries or one of each, by
-    default by Minari's action space, else by −1 and 1. `StoreError` names what does not fit, with the row of the file.
-    """
-    known = {"task": task, "cost_limit": cost_limit}
-    known = {key: value for key, value in known.items() if value is not None}
-    complete_card(known)  # a name that cannot be one is refused before the file is read
-    asked = common.Asked(None if agents is None else columns.read(agents), action_low, action_high)
-    path = _located(path)
+def read_hdf5(path: Path, asked: common.Asked) -> tuple[dict[str, Any], str]:
+    """What `EpisodeStore.from_steps` takes, of a DSRL, D4RL or Minari file, and the data's own name. The layout is
+    recognised by the names in the file."""
     with reading(path, "HDF5 of DSRL, D4RL or Minari"), h5py.File(path, "r") as f:
         episodes = _recognised(path, f)
         log = minari.read(path, f, episodes, asked) if episodes else _flat(path, f, asked)
-    return _store(path, log, asked.agents, known)
-
-
-def _store(path: Path, log: common.Logs, agents: columns.Columns | None, known: dict) -> EpisodeStore:
-    """The steps, shared out."""
-    bounds = log.bounds
-    notes = list(log.notes)
-    seen, done = log.observations[:, None], log.actions[:, None]
-    card: dict[str, Any] = {"agents": ["agent0"]}
-    if agents is not None:
-        widest = {kind: max(len(a[kind]) for a in agents.values()) for kind in ("observation", "action")}
-        rows = len(log.observations) * widest["observation"] + len(log.actions) * widest["action"]
-        arrays.fits(path, 4 * rows * len(agents))
-        seen = columns.take(log.observations, [a["observation"] for a in agents.values()])
-        own = [a["action"] for a in agents.values()]
-        bounds = common.of_agents(bounds, own)
-        done = columns.take(log.actions, own, bounds.middle)
-        card = {"agents": list(agents), "columns": agents}
-        sizes = [len(a["action"]) for a in agents.values()]
-        card |= {"action_sizes": sizes} if len({*sizes}) > 1 else {}
-        notes += [note] if (note := columns.note(agents)) else []
-    if log.costs is None:
-        notes.append("no costs are recorded, so every step has 0: what is learned from this knows no danger")
-    names = log.names
-    if names and agents is not None:  # several agents see different columns, so none has one name
-        names = [names[k] for k in next(iter(agents.values()))["observation"]] if len(agents) == 1 else None
-    flags = np.zeros((2, len(log.actions)), bool)
-    flags[np.where(log.terminated, 0, 1), log.ends - 1] = True
-    card |= {
-        "task": _task_name(log.name),
-        "simulator": log.simulator,
-        "provenance": f"imported from {log.layout}'s layout in '{path}'",
-        "action_low": bounds.low,
-        "action_high": bounds.high,
-        "observation_names": names,
-        "warnings": notes,
-        **known,
-    }
-    try:
-        return EpisodeStore(
-            np.ascontiguousarray(seen),
-            np.ascontiguousarray(done),
-            np.repeat(log.rewards[:, None], seen.shape[1], 1),
-            np.zeros(len(log.actions), np.float32) if log.costs is None else log.costs,
-            flags[0],
-            flags[1],
-            log.ends,
-            card=complete_card(card),
-        )
-    except UserError as error:
-        raise StoreError(f"'{path}': {error}") from None
-
-
-def _task_name(name: str) -> str:
-    """A data set's name as a task's; that of a task of ours would tie the data to its simulator."""
-    name = name.replace("/", "-").strip()
-    try:
-        schemas.check(name, schemas.Name)
-    except ValueError:
-        return "imported"
-    return f"{name}-imported" if name in registry.TASKS else name
+    return common.shared_out(path, log, asked.agents), log.name
 
 
 # --- finding and recognising ---
-def _located(given: str | os.PathLike) -> Path:
+def located(given: str | os.PathLike) -> Path:
     """The HDF5 file of a path, of a Minari data set's folder, or of its name."""
     path = Path(given)
     if path.is_file():
@@ -163,7 +79,7 @@ def _located(given: str | os.PathLike) -> Path:
         raise StoreError(
             f"There is no file '{path}', and no such Minari data set in '{folder}'; download it with Minari."
         )
-    return _located(folder)
+    return located(folder)
 
 
 def _recognised(path: Path, f: h5py.File) -> list[str]:
@@ -204,9 +120,9 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
     following = found.get("next_observations")
     seen, acted = _flat_widths(path, found)
     if asked.agents is not None:
-        columns.check(path, asked.agents, seen, acted)
+        common.check_agents(path, asked.agents, seen, acted)
     bounds = common.bounds_of(None, asked, acted)
-    arrays.affordable(path, sum(array.nbytes for array in found.values()), common.PACKED)
+    arrays.affordable(path, sum(array.nbytes for array in found.values()))
 
     terminals, timeouts = (common.flags(path, name, found[name], rows) for name in ("terminals", "timeouts"))
     ends = _ends(path, terminals | timeouts)
@@ -227,23 +143,19 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
     if following is not None:
         reached = common.numbers(path, "next_observations", following, kept)
         notes += _broken(path, observations, reached, ends)
-        observations = np.insert(observations, ends, reached[ends - 1], axis=0)
+        final = reached[ends - 1]
     else:
-        lengths = np.diff(ends, prepend=0)
-        notes.append(_given_up(lengths, terminated))
-        long = lengths > 1
-        if not long.any():
+        notes.append(_given_up(np.diff(ends, prepend=0), terminated))
+        steps, ends, last = common.without_last_steps(ends)
+        if not len(ends):
             raise StoreError(
                 f"'{path}' has no next_observations and no episode of two steps, so nothing says where a step led; "
                 "add next_observations."
             )
-        inside = np.ones(kept, bool)
-        inside[ends - 1] = False
-        observations = observations[np.repeat(long, lengths)]
-        actions, rewards = actions[inside], rewards[inside]
-        ends = np.cumsum(lengths[long] - 1)
+        final = observations[last]
+        observations, actions, rewards = observations[steps], actions[steps], rewards[steps]
         terminated = np.zeros(len(ends), bool)
-    return common.Logs(layout, observations, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
+    return common.Logs(layout, observations, final, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
 
 
 def _ends(path: Path, last: np.ndarray) -> np.ndarray:
@@ -300,12 +212,11 @@ def _given_up(lengths: np.ndarray, terminated: np.ndarray) -> str:
 
 def _broken(path: Path, observations: np.ndarray, reached: np.ndarray, ends: np.ndarray) -> list[str]:
     """Whether inside episodes a step leads to the next row: refused where many do not, else noted."""
-    inside = np.ones(len(observations), bool)
-    inside[ends - 1] = False
-    before = np.flatnonzero(inside)
-    some = observations[:: max(1, len(observations) // 100_000)].astype(np.float64)
-    slack = APART * some.std(0) + 1e-5 * np.abs(some).max(0)  # and single precision's rounding
-    wrong = [k[(np.abs(reached[k] - observations[k + 1]) > slack).any(1)] for k in _chunks(before)]
+    before = np.flatnonzero(common.inside(ends))
+    usual = observations[:: max(1, len(observations) // 100_000)].astype(np.float64)
+    slack = APART * usual.std(0) + 1e-5 * np.abs(usual).max(0)  # and single precision's rounding
+    some = (before[k : k + CHUNK] for k in range(0, len(before), CHUNK))
+    wrong = [k[(np.abs(reached[k] - observations[k + 1]) > slack).any(1)] for k in some]
     wrong = np.concatenate([*wrong, np.zeros(0, int)])
     if len(wrong) > STRAYS * len(before):
         raise StoreError(
@@ -318,7 +229,3 @@ def _broken(path: Path, observations: np.ndarray, reached: np.ndarray, ends: np.
         f"{len(wrong)} steps inside episodes, row {wrong[0]} first, do not lead to the next row; its observation was "
         "taken for where they led"
     ]
-
-
-def _chunks(rows: np.ndarray) -> Iterator[np.ndarray]:
-    return (rows[k : k + CHUNK] for k in range(0, len(rows), CHUNK))

@@ -20,8 +20,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ringfence.datasets.importers import columns, common
 from ringfence.errors import StoreError, reading, reason
+from ringfence.logs.io import common
 from ringfence.problem.bounds import Bounds
 from ringfence.utils import arrays, schemas
 
@@ -52,28 +52,27 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     _check_alike(path, found, episodes[0])
     seen, acted = _widths(path, first)
     if asked.agents is not None:
-        columns.check(path, asked.agents, seen, acted)
+        common.check_agents(path, asked.agents, seen, acted)
     bounds = common.bounds_of(_action_space(path, metadata, asked, acted), asked, acted)
-    arrays.affordable(path, sum(shapes.size for shapes in found.values()), common.PACKED)
+    arrays.affordable(path, sum(shapes.size for shapes in found.values()))
 
     found = _with_steps(path, found, notes)
     ends = np.cumsum([shapes.steps for shapes in found.values()], dtype=np.int64)
     steps = int(ends[-1])
-    observations = np.empty((steps + len(ends), seen), np.float32)
-    actions, rewards, costs = (np.empty(s, np.float32) for s in ((steps, acted), (steps,), (steps,)))
+    sizes = ((steps, seen), (len(ends), seen), (steps, acted), (steps,), (steps,))
+    observations, final, actions, rewards, costs = (np.empty(size, np.float32) for size in sizes)
     terminated, truncated = np.zeros((2, len(ends)), bool)
     for k, (name, shapes) in enumerate(found.items()):
-        here = _group(path, f, name)
         stop = int(ends[k])
         now = slice(stop - shapes.steps, stop)
-        observations[now.start + k : stop + k + 1] = _joined(path, here, name, shapes.observations)
-        actions[now] = _joined(path, here, name, shapes.actions)
+        rows = np.concatenate([_numbers(path, f, f"{name}/{key}") for key in shapes.observations], 1)
+        observations[now], final[k] = rows[:-1], rows[-1]
+        actions[now] = np.concatenate([_numbers(path, f, f"{name}/{key}") for key in shapes.actions], 1)
         common.within(path, f"{name}/actions", actions[now], bounds)
-        rewards[now] = common.numbers(path, f"{name}/rewards", arrays.array(path, here, "rewards"))[:, 0]
-        terminated[k], truncated[k] = _ended(path, here, name, shapes.steps)
+        rewards[now] = _numbers(path, f, f"{name}/rewards")[:, 0]
+        terminated[k], truncated[k] = _ended(path, f, name, shapes.steps)
         if first.cost:
-            cost = arrays.array(path, _group(path, here, "infos"), "cost")
-            costs[now] = common.numbers(path, f"{name}/infos/cost", cost)[-shapes.steps :, 0]
+            costs[now] = _numbers(path, f, f"{name}/infos/cost")[-shapes.steps :, 0]
     notes += _odd_ends(terminated, truncated)
     flat = tuple(first.observations) == ("observations",)
     if flat:
@@ -81,6 +80,7 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     return common.Logs(
         "Minari",
         observations,
+        final,
         actions,
         rewards,
         costs if first.cost else None,
@@ -185,19 +185,18 @@ def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
 
 def _leaves(path: Path, group: h5py.Group, kind: str, name: str) -> Iterator[tuple[str, h5py.Dataset]]:
     """The arrays of observations or actions, of groups in the order of their names."""
-    stack = [kind]
+    stack = [(kind, group)]
     count = 0
     while stack:
-        key = stack.pop()
-        holder, _, last = key.rpartition("/")
-        inside = _group(path, group, holder) if holder else group
-        found = arrays.member(path, inside, last, f"{name}/{key}")
+        key, holder = stack.pop()
+        last = key.rpartition("/")[2]
+        found = arrays.member(path, holder, last, f"{name}/{key}")
         if not isinstance(found, h5py.Group):
-            yield key, arrays.array(path, inside, last, f"{name}/{key}")
+            yield key, arrays.array(path, holder, last, f"{name}/{key}")
         elif key.count("/") >= DEEP:
             raise StoreError(f"'{path}' nests '{name}/{key[:200]}' too deeply; keep {DEEP} levels at most.")
         else:
-            stack += [f"{key}/{part}" for part in sorted(found, key=_place, reverse=True)]
+            stack += [(f"{key}/{part}", found) for part in sorted(found, key=_place, reverse=True)]
         count += 1
         if count > MANY:
             raise StoreError(f"'{path}' has more than {MANY} arrays in '{name}/{kind}'; join them into fewer.")
@@ -209,29 +208,21 @@ def _place(part: str) -> tuple[int, str]:
     return (int(match[1]) if match else -1, part)
 
 
-def _joined(path: Path, group: h5py.Group, name: str, parts: dict[str, tuple[int, ...]]) -> np.ndarray:
-    columns = [common.numbers(path, f"{name}/{key}", _array(path, group, key)) for key in parts]
-    return np.concatenate(columns, 1)
-
-
-def _group(path: Path, group: h5py.Group, name: str) -> h5py.Group:
-    """A group whose kind was looked at before."""
-    found = group[name]
-    if not isinstance(found, h5py.Group):
-        raise StoreError(f"'{path}' holds an array where the group '{name}' belongs; write the file again.")
+def _array(f: h5py.File, label: str) -> h5py.Dataset:
+    """An array that was looked at before, by its place in the file."""
+    found = f[label]
+    assert isinstance(found, h5py.Dataset)
     return found
 
 
-def _array(path: Path, group: h5py.Group, key: str) -> h5py.Dataset:
-    """An array below a group, by its path."""
-    holder, _, last = key.rpartition("/")
-    return arrays.array(path, _group(path, group, holder) if holder else group, last, key)
+def _numbers(path: Path, f: h5py.File, label: str) -> np.ndarray:
+    return common.numbers(path, label, _array(f, label))
 
 
-def _ended(path: Path, group: h5py.Group, name: str, steps: int) -> tuple[bool, bool]:
+def _ended(path: Path, f: h5py.File, name: str, steps: int) -> tuple[bool, bool]:
     """(terminated, truncated) of an episode's last step; a mark before it is refused."""
     terminated, truncated = (
-        common.flags(path, f"{name}/{key}", arrays.array(path, group, key), steps)
+        common.flags(path, f"{name}/{key}", _array(f, f"{name}/{key}"), steps)
         for key in ("terminations", "truncations")
     )
     early = np.flatnonzero((terminated | truncated)[:-1])
@@ -250,9 +241,7 @@ def _metadata(path: Path, f: h5py.File) -> dict:
         keys = ("total_episodes", "dataset_id", "env_spec", "action_space")
         return {k: v.decode() if isinstance(v := f.attrs[k], bytes) else v for k in keys if k in f.attrs}
     with reading(file, "metadata of Minari's", "copy it again, or read the HDF5 file without it"):
-        if file.stat().st_size > schemas.LARGEST:
-            raise ValueError(f"it is larger than {schemas.LARGEST / 2**20:.0f} MiB")
-        metadata = json.loads(file.read_bytes())
+        metadata = json.loads(schemas.content(file))
         if not isinstance(metadata, dict):
             raise ValueError("it is no object")
     return metadata

@@ -1,1 +1,0 @@
-"""Stores of files in other layouts: public data sets, and HDF5 of the kinds that the field shares."""
