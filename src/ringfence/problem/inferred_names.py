@@ -18,7 +18,7 @@ import numpy as np
 
 from ringfence.problem import partners
 from ringfence.problem.entries import SPACE, Entries
-from ringfence.problem.partners import ENTRIES, EXACT
+from ringfence.problem.partners import EXACT
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
