@@ -34,13 +34,15 @@ class Steps:
     low: np.ndarray  # (D,) of nearly all that was seen
     high: np.ndarray  # (D,)
     seen: dict[Cause, tuple[np.ndarray, np.ndarray, int, np.ndarray]]  # ranges, cells along an axis, cells of steps
+    fine: dict[Cause, np.ndarray]  # safe visits
 
     def cells(self, cause: Cause) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-        """(low, high, cells along each axis, (T, N, J) cell of each thing); remembered."""
+        """(low, high, cells along each axis, (T, N, J) cell of each thing in the part of its episode); remembered."""
         if cause not in self.seen:
             low, high = _range(self, cause)
             bins = _bins(cause, len(self.x) * self.x.shape[1])
-            self.seen[cause] = low, high, bins, _cell(cause, self.x, low, high, bins).astype(np.int32)
+            cell = _cell(cause, self.x, low, high, bins) + bins**cause.width * self.fold[:, None, None]
+            self.seen[cause] = low, high, bins, cell.astype(np.int32)
         return self.seen[cause]
 
     def picked(self, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
@@ -49,6 +51,20 @@ class Steps:
         cell = self.cells(narrowed(cause, ()))[-1]
         agents, things = np.nonzero(cause.holds(cell.shape[1]))
         return cell[:, agents, things], agents
+
+    def safe_visits(self, cause: Cause) -> np.ndarray:
+        """(FOLDS, cells) in safe steps; remembered."""
+        if cause not in self.fine:
+            cell, agents = self.picked(cause)
+            self.fine[cause] = self.visits(cell, agents, ~self.unsafe, self.cells(narrowed(cause, ()))[2] ** cause.width)
+        return self.fine[cause]
+
+    def visits(self, cell: np.ndarray, agents: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:
+        """(FOLDS, size) visits of cells (T, P) by agents (P,), by what each step weighs (T,) or (T, N)."""
+        some = np.flatnonzero(weight.reshape(len(weight), -1).any(1))  # of the others nothing is counted
+        of = agents if self.each else np.zeros(len(agents), int)
+        each = weight.reshape(len(weight), -1)[some][:, of]
+        return np.bincount(cell[some].ravel(), each.ravel(), FOLDS * size).reshape(FOLDS, size)
 
     @cached_property
     def varies(self) -> np.ndarray:
@@ -65,7 +81,7 @@ class Steps:
     def part(self, some: np.ndarray) -> Steps:
         """Those of the steps, `some` (T,) bool."""
         taken = {name: getattr(self, name)[some] for name in ("x", "unsafe", "fold", "episode")}
-        return replace(self, **taken, seen={})
+        return replace(self, **taken, seen={}, fine={})
 
     @property
     def each(self) -> bool:
@@ -77,16 +93,43 @@ class Steps:
 class Counted:
     """Cells of a cause, and what they say of each step without having counted its part."""
 
+    steps: Steps
     cells: Cells  # of all steps
+    others: np.ndarray  # (FOLDS, cells) probability of danger, by the steps of the other parts
+    visited: np.ndarray  # (FOLDS, cells) bool: by steps of the other parts
     safe: np.ndarray  # (T,) or (T, N) log P(safe) by this cause
-    called: np.ndarray  # (T,) or (T, N) bool: called unsafe as the cause is scored later, also where nobody was
-    near: np.ndarray  # (T,) or (T, N) bool: within a cell of danger, so that it may well explain an unsafe step
     gain: float = 0.0  # log likelihood of a step, beyond what was explained
     error: float = 0.0  # standard error of the gain over episodes
 
     @property
     def cause(self) -> Cause:
         return self.cells.cause
+
+    # Most that are counted gain nothing, and of these nobody asks for more.
+
+    @cached_property
+    def called(self) -> np.ndarray:
+        """(T,) or (T, N) bool: called unsafe as the cause is scored later, also where nobody was."""
+        if not self.others.any():
+            return np.zeros(self.safe.shape, bool)
+        unsafe = self.safe < np.log(0.5)
+        return unsafe if self.cause.length else unsafe | self._any_in(~self.visited)
+
+    @cached_property
+    def near(self) -> np.ndarray:
+        """(T,) or (T, N) bool: within a cell of danger, so that it may well explain an unsafe step."""
+        from scipy.ndimage import binary_dilation  # slow to import, and read by fits alone
+
+        if not self.others.any():
+            return np.zeros(self.safe.shape, bool)
+        width = self.cause.width
+        clear = (self.others > CLEAR).reshape(FOLDS, *[self.cells.bins] * width)
+        return self._any_in(binary_dilation(clear, np.ones((1, *[3] * width))))
+
+    def _any_in(self, these: np.ndarray) -> np.ndarray:
+        """(T,) or (T, N) bool: something that the cause is about is in one of these cells, FOLDS times each."""
+        cell, agents = self.steps.picked(self.cause)
+        return _worst(self.steps, np.where(these.ravel(), -1.0, 0.0)[cell], agents) < 0
 
 
 def some_steps(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, rng: np.random.Generator) -> Steps:
@@ -98,7 +141,7 @@ def some_steps(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, rng: np.r
     flat = x[:: max(1, x[..., 0].size // 200_000)].reshape(-1, x.shape[-1])
     low, high = np.quantile(flat, [0.0005, 0.9995], axis=0)
     fold = rng.permutation(int(episode.max()) + 1) % FOLDS
-    return Steps(x, unsafe[some], fold[episode[some]], episode[some], low, high, {})
+    return Steps(x, unsafe[some], fold[episode[some]], episode[some], low, high, {}, {})
 
 
 def _sampled(bad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -114,8 +157,9 @@ def _sampled(bad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What several causes tell of the steps, the worst of them."""
+    """What several causes tell of steps, the worst of them."""
 
+    steps: Steps
     safe: np.ndarray  # (T,) or (T, N) log P(safe)
     near: np.ndarray  # (T,) or (T, N) bool
 
@@ -123,51 +167,38 @@ class Explained:
     def by(cls, steps: Steps, chosen: Sequence[Counted]) -> Explained:
         nothing = np.zeros(steps.unsafe.shape)
         safe = np.minimum.reduce([nothing, *[one.safe for one in chosen]])
-        return cls(safe, np.logical_or.reduce([nothing > 0, *[one.near for one in chosen]]))
+        return cls(steps, safe, np.logical_or.reduce([nothing > 0, *[one.near for one in chosen]]))
 
-    def part(self, some: np.ndarray) -> Explained:
-        """What explains some of the steps (T,) bool."""
-        return Explained(self.safe[some], self.near[some])
+    def of(self, steps: Steps, some: np.ndarray) -> Explained:
+        """What they tell of those that are some (T,) bool of the steps."""
+        return Explained(steps, self.safe[some], self.near[some])
 
-    def left(self, unsafe: np.ndarray) -> np.ndarray:
+    @cached_property
+    def left(self) -> np.ndarray:
         """(T,) or (T, N) how much of each unsafe step is still to be explained. At the edge of a cause that is nothing:
         cells are too coarse to tell, and what they leave there is no cause of its own."""
-        return np.exp(self.safe) * unsafe * ~self.near
+        return np.exp(self.safe) * self.steps.unsafe * ~self.near
+
+    @cached_property
+    def likelihood(self) -> np.ndarray:
+        return likelihood(self.steps, self.safe)
 
 
 def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
     """The cause, by what others leave unexplained."""
-    from scipy.ndimage import binary_dilation  # slow to import, and read by fits alone
-
     low, high, bins, _ = steps.cells(narrowed(cause, ()))
     cell, agents = steps.picked(cause)
-    size = bins**cause.width
-    left = explained.left(steps.unsafe)
-    of = agents if steps.each else np.zeros(len(agents), int)
-    place = (cell + size * steps.fold[:, None]).ravel()
-    bad = np.bincount(place, _by(left, of).ravel(), FOLDS * size).reshape(FOLDS, size)
-    fine = np.bincount(place, _by(~steps.unsafe, of).ravel().astype(float), FOLDS * size).reshape(FOLDS, size)
+    left = explained.left
+    bad, fine = steps.visits(cell, agents, left, bins**cause.width), steps.safe_visits(cause)
     usual = left.sum() / max(left.sum() + (~steps.unsafe).sum(), 1.0)
     all_bad, all_fine = bad.sum(0), fine.sum(0)
     cells = Cells(cause, low, high, bins, all_bad + all_fine, _danger(all_bad, all_fine, usual))
     others = _danger(all_bad - bad, all_fine - fine, usual)  # (FOLDS, size)
+    visited = all_bad + all_fine - bad - fine > 0
     if not others.any():
-        nothing = np.zeros(steps.unsafe.shape)
-        return Counted(cells, nothing, nothing > 0, nothing > 0)
-    safe = _worst(steps, np.log1p(-others)[steps.fold[:, None], cell], agents)
-    called = safe < np.log(0.5)
-    if not cause.length:
-        seen = all_bad + all_fine - bad - fine > 0
-        called |= _worst(steps, np.where(seen, 0.0, -1.0)[steps.fold[:, None], cell], agents) < 0
-    clear = (others > CLEAR).reshape(FOLDS, *[bins] * cause.width)
-    edge = binary_dilation(clear, np.ones((1, *[3] * cause.width))).reshape(FOLDS, size)
-    near = _worst(steps, np.where(edge, -1.0, 0.0)[steps.fold[:, None], cell], agents) < 0
-    return Counted(cells, safe, called, near, *gain(steps, explained, safe))
-
-
-def _by(values: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """(T, P) of values (T,) of the team or (T, N): those of the agents `of`."""
-    return values.reshape(len(values), -1)[:, of]
+        return Counted(steps, cells, others, visited, np.zeros(steps.unsafe.shape))
+    safe = _worst(steps, np.log1p(-others).ravel()[cell], agents)
+    return Counted(steps, cells, others, visited, safe, *gain(steps, explained, safe))
 
 
 def _danger(bad: np.ndarray, fine: np.ndarray, usual: float) -> np.ndarray:
@@ -191,7 +222,7 @@ def _worst(steps: Steps, each: np.ndarray, agents: np.ndarray) -> np.ndarray:
 
 def gain(steps: Steps, explained: Explained, safe: np.ndarray) -> tuple[float, float]:
     """(log likelihood that a cause adds to a step, its standard error over episodes)."""
-    more = likelihood(steps, np.minimum(explained.safe, safe)) - likelihood(steps, explained.safe)
+    more = likelihood(steps, np.minimum(explained.safe, safe)) - explained.likelihood
     more = np.where(steps.unsafe & explained.near, 0.0, more)
     more = more if more.ndim == 1 else more.sum(1)
     totals = np.bincount(steps.episode, more)

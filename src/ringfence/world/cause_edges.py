@@ -26,7 +26,7 @@ def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edg
     agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
     values = cause.of(steps.x)[:, agents, things, 0]
     value = _of_the_worst(steps, values, signed(values, edge), agents)
-    left = explained.left(steps.unsafe) > 0.5
+    left = explained.left > 0.5
     size = (edge.high[0] - edge.low[0]) / CELLS[1]
     bounds = list(edge.bounds)
     for k, bound in enumerate(edge.bounds):

@@ -281,17 +281,17 @@ def _added(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], pure: flo
 def _tells_nearly_all(steps: Steps, one: Counted, explained: Explained) -> bool:
     """Whether a cause of one number tells nearly all that is left, of episodes that its edges were not read off. Danger
     that is scarce lies in a few episodes, of which some hold most of it; no gain is many standard errors there."""
-    left = explained.left(steps.unsafe) > 0.5
+    left = explained.left > 0.5
     if not one.cells.edge.bounds or len(np.unique(steps.episode[left if left.ndim == 1 else left.any(1)])) < FEW:
         return False
     safe = np.zeros(steps.unsafe.shape)
     for fold in np.unique(steps.fold):
         rest, own = steps.part(steps.fold != fold), steps.part(steps.fold == fold)
-        edge = refined(rest, one.cells.edge, one.cause, explained.part(steps.fold != fold))
+        edge = refined(rest, one.cells.edge, one.cause, explained.of(rest, steps.fold != fold))
         called = within(rest, one.cause, edge)
         share = min(rest.unsafe[called].mean(), 0.999) if called.any() else 0.0
         safe[steps.fold == fold] = np.where(within(own, one.cause, edge), np.log1p(-share), 0.0)
-    to_win = -likelihood(steps, explained.safe).mean() * (1 if steps.unsafe.ndim == 1 else steps.unsafe.shape[1])
+    to_win = -explained.likelihood.mean() * (1 if steps.unsafe.ndim == 1 else steps.unsafe.shape[1])
     return gain(steps, explained, safe)[0] > NEARLY_ALL * to_win
 
 
