@@ -18,7 +18,6 @@ import numpy as np
 from ringfence.errors import StoreError, of_kind, whole_number
 from ringfence.logs.store import EpisodeStore
 
-VERSION = 1  # of how delays are found: Worlds that were judged by another are judged again
 LONGEST = 10  # steps of a delay that is looked for
 CLEARLY = 2.0  # times what the command of the step itself adds to a late one, which that has to add to it
 LITTLE = 0.05  # of one entry's change: what explains less is nobody's command

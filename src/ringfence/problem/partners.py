@@ -16,7 +16,6 @@ import numpy as np
 
 from ringfence.types import Array
 
-VERSION = 1  # of what is found
 ROWS = 500  # that are compared
 MOST = 4_000_000  # numbers that are compared, and equal ones that are found; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
@@ -94,8 +93,8 @@ def _of_sign(x: np.ndarray, rare: np.ndarray, sign: int) -> list[list[int]]:
 
 
 def _equal(x: np.ndarray, rare: np.ndarray, sign: int) -> list[np.ndarray]:
-    """The rows of x (W, N, F) that are looked at, and of P numbers in them that two agents share up to the sign the row,
-    agent, entry and the other's entry (P,). It ends early where too many are shared."""
+    """The rows of x (W, N, F) that are looked at, and of P numbers in them that two agents share up to the sign the
+    row, agent, entry and the other's entry (P,). It ends early where too many are shared."""
     near = EXACT * x.std((0, 1))
     found = []
     left = MOST

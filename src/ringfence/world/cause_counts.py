@@ -56,7 +56,8 @@ class Steps:
         """(FOLDS, cells) in safe steps; remembered."""
         if cause not in self.fine:
             cell, agents = self.picked(cause)
-            self.fine[cause] = self.visits(cell, agents, ~self.unsafe, self.cells(narrowed(cause, ()))[2] ** cause.width)
+            bins = self.cells(narrowed(cause, ()))[2]
+            self.fine[cause] = self.visits(cell, agents, ~self.unsafe, bins**cause.width)
         return self.fine[cause]
 
     def visits(self, cell: np.ndarray, agents: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:

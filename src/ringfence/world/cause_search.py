@@ -34,7 +34,6 @@ from ringfence.world.causes import Cause, Found, in_one_number, narrowed, only_o
 from ringfence.world.cells import Cells
 from ringfence.world.readings import How
 
-VERSION = 21  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from safetensors import SafetensorError, safe_open
 from ringfence.errors import UserError
 from ringfence.logs import late
 from ringfence.logs.store import EpisodeStore, team
-from ringfence.problem import constraints, features, partners
+from ringfence.problem import constraints, features
 from ringfence.problem.normalise import varying
 from ringfence.types import Key, Spec
 from ringfence.utils.cache import cache_dir
@@ -47,7 +46,7 @@ from ringfence.world.settings import Settings
 from ringfence.world.storage import blank_barrier, blank_world, load, save
 from ringfence.world.verdict import judge
 
-FORMAT = 5  # of what is fitted: what is cached of another is made again
+FORMAT = 6  # of what is fitted, found and told: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.95  # recall of causes, below which networks on all entries are tried, too
 STATES = 20_000  # steps that a barrier's features are standardised by
@@ -70,16 +69,6 @@ PARTS = {
     "future": ("future_updates", "future_discount", "expectile"),
 }
 UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}
-
-# What settings are called in the names of the cache's files.
-_CALLED = {
-    "execution": "sight",
-    "num_ensemble": "members",
-    "use_transition": "both_ends",
-    "miscoverage": "missed",
-    "predicted_share": "foreseen",
-}
-_EXECUTIONS = {"centralized": "all", "decentralized": "own"}
 
 T = TypeVar("T")
 Search = Callable[[World, Logged], float | None]  # share of what a guard's search calls safe, and the logs dangerous
@@ -104,27 +93,9 @@ def fit_view(
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached, bar or Parts("", (), quiet=True))
-    content = [
-        validate.VERSION,
-        cause_search.VERSION,
-        impacts.VERSION,
-        margins.VERSION,
-        late.VERSION,
-        store.content,
-        features.to_dict(map),
-        *_bounds(store),
-    ]
-    content += [settings.miscoverage, settings.barrier]
-    # What the card tells beside; `content` of agents who see for themselves is of the whole team's logs.
-    content += [store.card.task, store.card.hazard, store.card.dt, store.card.content]
-    content += ["undelayed by", store.card.action_delay] if store.card.action_delay else []
-    content += [store.limits, "unsafe costs"] if store.limits else []
-    content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
-    content += ["of", named] if (named := _agents(store)) else []
-    heading = Heading.of(map.names)
-    content += [AHEAD] if heading else []
-    content += ["with what is relative to it"] if heading and not set(heading.about) <= set(map.follows) else []
-    file = parts.file("world", list(PARTS), content)
+    card = store.card  # `content` of agents who see for themselves is of the whole team's logs
+    told = [card.task, card.hazard, card.dt, card.content, card.action_delay, card.origins, _agents(store)]
+    file = parts.file("world", [store.content, features.to_dict(map), card.bounds, store.limits, *told])
     if cached and (kept := _kept_world(file, map, store, settings, seed)) is not None:
         return kept
     if cached:
@@ -150,10 +121,8 @@ def _fitted(
     labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
     out = held_out(store, parts.seed, unsafe_of(labels) if labels else None)
     whole = logged = Logged.of(store, map, out, labels)
-    moved = store.digest("observations", "state", "actions", "episode_ends", "terminated") + _digest(out)
-    moved += "".join(_bounds(store)) + "".join(str(tuple(turn)) for turn in map.turns)
-    if "observations" in map.reads and (map.minus >= 0).any():  # the same arrays are other features then
-        moved += f"less {_digest(map.plus)} {_digest(map.minus)}"
+    arrays = store.digest("observations", "state", "actions", "episode_ends", "terminated")
+    moved = [arrays, _digest(out), store.card.bounds, map.turns, _digest(map.plus), _digest(map.minus)]
 
     world = blank_world(map, spec, settings)
     value = _values(logged, moved, world.values, parts)
@@ -161,11 +130,11 @@ def _fitted(
     steps = logged.fitted_steps
     if thrown:
         steps = steps[~logged.unsafe[steps]]
-        moved += f"{impacts.VERSION} landed {_digest(logged.unsafe)}"
+        moved.append(_digest(logged.unsafe))
     acts = _dynamics(logged, steps, moved, world.dynamics, parts)
     if map.mirrored:
         acts = _with_partners(acts, logged, steps, moved, parts)
-        moved += "partners" if acts.map.mirrored else ""
+        moved.append(acts.map.mirrored)
     if thrown:
         logged = impacts.landed(logged, acts)
     barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts)
@@ -279,7 +248,7 @@ def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
 def _dynamics(
     logged: Logged,
     steps: np.ndarray,
-    moved: str,
+    moved: list[Any],
     blank: dynamics.Dynamics,
     parts: _Parts,
 ) -> dynamics.Dynamics:
@@ -298,24 +267,24 @@ def _dynamics(
             width=settings.dynamics_width,
         )
 
-    return parts.get("dynamics", [moved], blank, fit)
+    return parts.get("dynamics", moved, blank, fit)
 
 
 def _with_partners(
-    plain: dynamics.Dynamics, logged: Logged, steps: np.ndarray, moved: str, parts: _Parts
+    plain: dynamics.Dynamics, logged: Logged, steps: np.ndarray, moved: list[Any], parts: _Parts
 ) -> dynamics.Dynamics:
     """The dynamics that read what those do who are in lists of the nearest, if they predict held-out windows better
     than plain ones: in long lists they learn by heart who does what."""
     settings = parts.settings
     action = logged.arrays["actions"].shape[-1]
     blank = dynamics.blank_dynamics(logged.map, action, settings.num_ensemble, settings.dynamics_width)
-    told = _dynamics(logged, steps, f"{moved} {partners.VERSION} {logged.map.mirrored}", blank, parts)
+    told = _dynamics(logged, steps, [*moved, logged.map.mirrored], blank, parts)
     errors = [validate.prediction_error(each, logged, np.random.default_rng(4)) for each in (told, plain)]
     ours, theirs = (np.mean(error.error_of_change) for error in errors)
     return told if ours < theirs else plain
 
 
-def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts) -> values.Values:
+def _values(logged: Logged, moved: list[Any], blank: values.Values, parts: _Parts) -> values.Values:
     settings = parts.settings
     alone = settings.execution == "decentralized"
 
@@ -331,7 +300,7 @@ def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts) -> 
             alone=alone,
         )
 
-    return parts.get("values", [moved, logged.store.digest("rewards")], blank, fit)
+    return parts.get("values", [*moved, logged.store.digest("rewards")], blank, fit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,22 +320,16 @@ class _Search:
         return cause_search.find(x, logged.label[steps], episode, logged.map.names, self.seed)
 
 
-def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
+def _causes(search: _Search, moved: list[Any], parts: _Parts) -> Found:
     """The causes of one constraint's danger; none where few entries do not explain it, or is of a whole body."""
     settings = parts.settings
     logged = search.logged
     plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
     if not plain or logged.map.shared_body or logged.map.joint:
         return Found()
-    content = [moved, cause_search.VERSION, _digest(logged.label), logged.map.names]
+    content = [*moved, _digest(logged.label), logged.map.names]
     found = parts.json("causes", content, Found, lambda: search.result[0])
     return found if found.explained >= EXPLAINED else Found()
-
-
-def _bounds(store: EpisodeStore) -> list[str]:
-    """Within which actions are learned, where these are not the usual ones: the same arrays are other logs then."""
-    bounds = store.card.bounds
-    return [] if bounds == (-1.0, 1.0) else [repr(tuple(bounds))]
 
 
 def _digest(array: np.ndarray) -> str:
@@ -374,7 +337,7 @@ def _digest(array: np.ndarray) -> str:
 
 
 def _barrier(
-    logged: Logged, names: tuple[str, ...], moved: str, acts: dynamics.Dynamics, parts: _Parts
+    logged: Logged, names: tuple[str, ...], moved: list[Any], acts: dynamics.Dynamics, parts: _Parts
 ) -> tuple[cbf.Barrier | cbf.MinBarrier | None, dict[str, Found]]:
     """The barrier of all constraints, and the causes of the danger of each; None where there are none."""
     searches = {name: _Search(logged.by(name), parts.seed) for name in names}
@@ -386,7 +349,7 @@ def _barrier(
     return cbf.MinBarrier(tuple(each), names) if logged.several else each[0], causes
 
 
-def _label_of(search: _Search, moved: str, acts: dynamics.Dynamics, parts: _Parts) -> tuple[Found, cbf.Barrier]:
+def _label_of(search: _Search, moved: list[Any], acts: dynamics.Dynamics, parts: _Parts) -> tuple[Found, cbf.Barrier]:
     """The causes of one constraint's danger, and ℓ by them; no causes, and ℓ by networks on all entries, where held-out
     steps say that these tell more."""
     found = _causes(search, moved, parts)
@@ -402,27 +365,19 @@ def _label_of(search: _Search, moved: str, acts: dynamics.Dynamics, parts: _Part
     return found, label
 
 
-def _labelled(search: _Search, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts) -> cbf.Barrier:
+def _labelled(search: _Search, moved: list[Any], acts: dynamics.Dynamics, found: Found, parts: _Parts) -> cbf.Barrier:
     """ℓ of one constraint."""
     content = _about(search, moved, found)
     template = eqx.filter_eval_shape(blank_barrier, search.logged.map, parts.settings, found)
     return parts.get("label", content, template, lambda key: _label(search, acts, parts.settings, found, key))
 
 
-def _about(search: _Search, moved: str, found: Found) -> list[Any]:
+def _about(search: _Search, moved: list[Any], found: Found) -> list[Any]:
     """What a barrier is made of, beside its settings."""
-    logged = search.logged
-    return [
-        moved,
-        _digest(logged.label),
-        cause_search.VERSION,
-        margins.VERSION,
-        logged.map.names,
-        msgspec.to_builtins(found),
-    ]
+    return [*moved, _digest(search.logged.label), search.logged.map.names, found]
 
 
-def _with_future(label: cbf.Barrier, search: _Search, moved: str, found: Found, parts: _Parts) -> cbf.Barrier:
+def _with_future(label: cbf.Barrier, search: _Search, moved: list[Any], found: Found, parts: _Parts) -> cbf.Barrier:
     """ℓ and V of one constraint."""
     settings = parts.settings
     logged = search.logged
@@ -532,27 +487,22 @@ class _Parts:
     cached: bool
     bar: Parts
 
-    def file(self, name: str, of: Sequence[str], content: list[Any]) -> Path:
-        """Where what depends on the settings of the parts `of` and on `content` is kept."""
-        names = [field for part in of for field in PARTS[part]]
-        fields = {_CALLED.get(field, field): getattr(self.settings, field) for field in names}
-        about = [
-            FORMAT,
-            name,
-            content,
-            self.settings.view,
-            _EXECUTIONS[self.settings.execution],
-            fields,
-            self.seed,
-        ]
-        if self.formula and {"label", "future"} & set(of):
-            about.append(self.formula)
-        code = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+    def file(self, name: str, content: list[Any], of: Sequence[str] | None = None) -> Path:
+        """Where what depends on `content` and on the settings is kept: on those of the parts `of`, or on all."""
+        settings = dataclasses.asdict(self.settings)
+        formula = self.formula
+        if of is not None:
+            read = {"view", "execution", *(field for part in of for field in PARTS[part])}
+            settings = {field: value for field, value in settings.items() if field in read}
+            formula = formula if {"label", "future"} & set(of) else None
+        about = [FORMAT, name, content, settings, self.seed, formula]
+        written = msgspec.json.encode(about, enc_hook=np.ndarray.tolist, order="deterministic")
+        code = hashlib.sha256(written).hexdigest()[:16]
         return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
 
     def json(self, name: str, content: list[Any], kind: type[T], make: Callable[[], T]) -> T:
         """What is found about a part before it is fitted, likewise."""
-        file = self.file(name, ["label"], content).with_suffix(".json")
+        file = self.file(name, content, ["label"]).with_suffix(".json")
         if self.cached and file.exists():
             try:
                 return msgspec.json.decode(file.read_bytes(), type=kind)
@@ -567,7 +517,7 @@ class _Parts:
 
     def get(self, name: str, content: list[Any], template: T, make: Callable[[Key], T]) -> T:
         """The part of that name; made, and then kept, where it is not there."""
-        file = self.file(name, [*UPON[name], name], content)
+        file = self.file(name, content, [*UPON[name], name])
         if self.cached and (kept := _read(file, template)) is not None:
             self.bar.skip(name)
             return kept
@@ -579,12 +529,12 @@ class _Parts:
 
 
 def _read(file: Path, template: T) -> T | None:
-    """A cached part; None where there is none, a damaged one, or another's: those of before tell no key."""
+    """A cached part; None where there is none, a damaged one, or another's."""
     if not file.exists():
         return None
     try:
         with safe_open(file, "numpy") as opened:
-            key = (opened.metadata() or {}).get("key", file.stem)
+            key = (opened.metadata() or {}).get("key")
         return load_named(file, template) if key == file.stem else None
     except (SafetensorError, OSError, UserError):
         return None

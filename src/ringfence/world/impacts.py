@@ -19,7 +19,6 @@ from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 from ringfence.world.margins import entries
 
-VERSION = 2  # of what is found
 MOST = 60_000  # steps of agents that are looked at at once
 USUAL = 0.999  # share of safe steps that change by no more than what is usual
 BEYOND = 2.0  # times what is usual, from which on a change is an impact

@@ -17,7 +17,6 @@ from ringfence.world.cause_nets import Score, least_margin, with_margin, worst
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 
-VERSION = 3  # of margins of causes: scores of another are learned again
 WINDOWS = 3000  # entries, and safe steps, that margins are read from
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 BEARABLE = 0.8  # share of safe steps that should have the margin

@@ -42,7 +42,6 @@ from ringfence.world.margins import (
 from ringfence.world.model import World
 from ringfence.world.values import Values
 
-VERSION = 19  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 STEPS = 60_000  # held-out steps that are scored
 SCORED = 20_000  # of them at once
