@@ -25,8 +25,7 @@ from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, BehaviourPolicy, save_behaviour
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.datasets.robots import Numbers, choose, file_of
-from ringfence.envs.base import Simulation
-from ringfence.envs.mujoco import Parts, SafeMuJoCo
+from ringfence.envs.mujoco import Parts, SafeMuJoCo, Simulation
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key
 
@@ -186,7 +185,7 @@ class Trainer:
             shape = (self.config.robots, self.env.n_agents, self.env.action_dim)
             return self.rng.uniform(-1, 1, shape).astype(np.float32)
         self.key, key = jax.random.split(self.key)
-        observations = self.sim.observe(state)
+        observations = self.sim.observe().observations
         return np.asarray(choose(self.learner.actors, observations, self.config.learner.noise, key))
 
     def _begin_again(self, over: np.ndarray) -> None:
@@ -246,7 +245,7 @@ def returns(env: SafeMuJoCo, actors: Mlp, sim: Simulation, seed: int, noise: flo
         if not sim.running.any():
             break
         key, key_noise = jax.random.split(key)
-        action = choose(actors, sim.observe().astype(np.float32), noise, key_noise)
+        action = choose(actors, sim.observe().observations, noise, key_noise)
         total += sim.step(np.asarray(action)).reward
     return total
 

@@ -21,7 +21,7 @@ import numpy as np
 from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, resimulate, suffix
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
-from ringfence.envs.base import Env
+from ringfence.envs.base import PureEnv
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key, PyTree
@@ -51,7 +51,7 @@ class _Memory(NamedTuple):
 
 
 def train_behaviour(
-    env: Env,
+    env: PureEnv,
     config: MATD3Config,
     key: Key,
     transitions: int,
@@ -147,13 +147,13 @@ def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
 
 
 @partial(jax.jit, static_argnums=(0, 1))  # dozens of small arrays: one compilation instead of one for each operation
-def _init_learner(env: Env, config: MATD3Config, key: Key) -> Learner:
+def _init_learner(env: PureEnv, config: MATD3Config, key: Key) -> Learner:
     n = env.n_agents
     width = env.observation_dim
     return matd3.init(config, key, n, width, n * width, env.action_dim)
 
 
-def _empty_memory(env: Env, episodes: int) -> _Memory:
+def _empty_memory(env: PureEnv, episodes: int) -> _Memory:
     length = env.episode_length
     n = env.n_agents
     state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
@@ -167,7 +167,7 @@ def _empty_memory(env: Env, episodes: int) -> _Memory:
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
 def _train_rounds(
-    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
+    env: PureEnv, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
 ) -> tuple[Learner, _Memory, Array]:
     """For every round: one episode in each environment, then the updates. Returns the rounds' mean returns too."""
 
@@ -199,7 +199,7 @@ def _train_rounds(
     return learner, memory, scores
 
 
-def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
+def _explore(env: PureEnv, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
     """One episode in each of the config's environments, laid out as the buffer's rows."""
     key_reset, key = jax.random.split(key)
     first = env.reset(key_reset, config.envs)
@@ -219,7 +219,7 @@ def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Ke
 
 
 def _update(
-    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
+    env: PureEnv, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
 ) -> Learner:
     """One critic update and, if `act`, one update of actors and targets."""
     key_rows, key_noise = jax.random.split(key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -93,6 +94,8 @@ class Episode:
         self.terminated = False
         self.unsafe_start = False
         self.told: set[str] = set()  # what infos tell that have no cost
+        self.charged = False  # some step told its cost
+        self.counts = Counter[str]()  # steps in which a guard failed, or did not know
         self.running = True
         self.showed_end = True
         begun = env.reset(seed=seed)
@@ -216,6 +219,7 @@ class Episode:
                 f"Step {len(self.rewards)} of {self.name} tells one cost, those before several; name them all."
             )
         self.costs.append(self._of_agents(charged, "cost=" if cost is not None else self.name))
+        self.charged = True
 
     def _take_constraints(self, costs: Mapping[Any, Any]) -> None:
         """The step's cost by each constraint's name."""

@@ -247,7 +247,7 @@ class SafeMuJoCoParallel(_Parallel):
             dict.fromkeys(agents, float(out.reward[0])),
             dict.fromkeys(agents, fallen),
             dict.fromkeys(agents, over),
-            self._infos(cost=float(out.cost[0]), speed=float(out.speed[0])),
+            self._infos(cost=float(out.cost[0]), speed=float(out.info["speed"][0])),
         )
         if over or fallen:
             self.agents = []
@@ -263,7 +263,7 @@ class SafeMuJoCoParallel(_Parallel):
         """Draws nothing; videos come from the report."""
 
     def _observations(self) -> dict[str, np.ndarray]:
-        return dict(zip(self.possible_agents, self._sim.observe()[0]))
+        return dict(zip(self.possible_agents, self._sim.state()[0, self.core.observed]))
 
     def _infos(self, cost: float, speed: float) -> dict[str, dict[str, float]]:
         """What one body did, for every agent."""
