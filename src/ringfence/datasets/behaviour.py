@@ -29,8 +29,9 @@ from safetensors.numpy import save_file
 from ringfence.datasets import matd3
 from ringfence.datasets.matd3 import Mlp
 from ringfence.envs.base import PureEnv
+from ringfence.envs.rollout import scanned
 from ringfence.errors import CheckpointError, UserError, unknown
-from ringfence.types import Array, Key, PyTree
+from ringfence.types import Array, Key, PyTree, Transition
 from ringfence.utils.files import whole
 
 POLICIES = Path(__file__).parent / "policies"
@@ -161,22 +162,18 @@ def _rollout_actions(env: PureEnv, first: PyTree, actions: Array) -> dict[str, A
 
 
 def rollout(env: PureEnv, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
-    """Arrays (B, L, ...) of episodes from `first`, under actions `choose(state, x)`, x along the first axis of `xs`."""
+    """Arrays (B, L, ...) of the episodes that `envs.rollout.scanned` plays."""
+    return logged(env, *scanned(env, first, choose, xs))
 
-    def step(state, x):
-        action = choose(state, x)
-        after, transition = env.step(state, action)
-        return after, (after, action, transition.reward, transition.cost)
 
-    _, (after, *rest) = jax.lax.scan(step, first, xs)
-    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
-    actions, rewards, costs = (jnp.swapaxes(x, 0, 1) for x in rest)
+def logged(env: PureEnv, states: PyTree, actions: Array, transitions: Transition) -> dict[str, Array]:
+    """What logs hold of episodes (B, L, ...)."""
     return {
         "observations": jax.vmap(env.observe, 1, 1)(states),
         "state": jax.vmap(env.global_state, 1, 1)(states),
         "actions": actions,
-        "rewards": rewards,
-        "costs": costs,
+        "rewards": transitions.reward,
+        "costs": transitions.cost,
     }
 
 

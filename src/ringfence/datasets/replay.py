@@ -22,6 +22,7 @@ from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, resimulate, suffix
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.envs.base import PureEnv
+from ringfence.envs.rollout import scanned
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key, PyTree
@@ -204,18 +205,15 @@ def _explore(env: PureEnv, config: MATD3Config, actors: Mlp, uniform: Array, key
     key_reset, key = jax.random.split(key)
     first = env.reset(key_reset, config.envs)
 
-    def step(state, key):
+    def choose(state: PyTree, key: Key) -> Array:
         key_noise, key_uniform = jax.random.split(key)
         action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, key_noise)
         action = jnp.where(uniform, jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0), action)
         # Executed at half precision, so that a replay file of half the size repeats the run exactly.
-        action = action.astype(jnp.float16).astype(jnp.float32)
-        after, transition = env.step(state, action)
-        return after, (after, action, transition.reward, transition.terminated)
+        return action.astype(jnp.float16).astype(jnp.float32)
 
-    _, (after, actions, rewards, terminated) = jax.lax.scan(step, first, jax.random.split(key, env.episode_length))
-    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
-    return _Memory(states, *(jnp.swapaxes(x, 0, 1) for x in (actions, rewards, terminated)))
+    states, actions, out = scanned(env, first, choose, jax.random.split(key, env.episode_length))
+    return _Memory(states, actions, out.reward, out.terminated)
 
 
 def _update(

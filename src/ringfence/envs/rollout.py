@@ -1,4 +1,4 @@
-"""Episodes are played: the one loop over whatever steps outside JAX."""
+"""Episodes are played: `rollout` loops over whatever steps outside JAX, `scanned` is that loop within JAX."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.base import Env, Outcome, Seen
-from ringfence.types import Key, Policy, PolicyStep, PyTree, act_with, with_cost
+from ringfence.envs.base import Env, Outcome, PureEnv, Seen
+from ringfence.types import Array, Key, Policy, PolicyStep, PyTree, Transition, act_with, with_cost
 
 
 class Moment(NamedTuple):
@@ -45,6 +46,22 @@ def rollout(policy: Policy, env: Env, watch: Watch, keys: Iterator[Any]) -> None
         watch(Moment(running, before, decided, outcome, after))
         carry = with_cost(policy, carry, outcome.cost)
         before = after
+
+
+def scanned(
+    env: PureEnv, first: PyTree, choose: Callable[[PyTree, Any], Array], xs: PyTree
+) -> tuple[PyTree, Array, Transition]:
+    """(states (B, L+1, ...), actions (B, L, N, A), what came of them (B, L, ...)) of episodes from the states `first`,
+    under actions `choose(state, x)`, x along the first axis of `xs`."""
+
+    def step(state: PyTree, x: Any) -> tuple[PyTree, tuple[PyTree, Array, Transition]]:
+        action = choose(state, x)
+        after, transition = env.step(state, action)
+        return after, (after, action, transition)
+
+    _, (after, actions, transitions) = jax.lax.scan(step, first, xs)
+    states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, after)
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (states, actions, transitions))
 
 
 @dataclass(frozen=True)
