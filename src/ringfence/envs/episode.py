@@ -138,6 +138,16 @@ class Episode:
         """It has ended, and nothing is missing of its last step."""
         return not self.running and (self.skipped or not self.lacks_cost)
 
+    @property
+    def team_rewards(self) -> np.ndarray:
+        """(L,) the mean over agents."""
+        return np.array([reward.mean() for reward in self.rewards])
+
+    @property
+    def team_costs(self) -> np.ndarray:
+        """(L,) the largest of the agents' costs."""
+        return np.array([np.max(cost) for cost in self.costs])
+
     def charge(self, cost: float) -> None:
         """Set the cost of the last step, if nothing has."""
         if self.lacks_cost:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ringfence.errors import UserError
 Charge = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 
 
+@dataclass(eq=False)
 class SideBySide:
     """PettingZoo `ParallelEnv`s, whose `episodes` keep what came of each.
 
@@ -21,22 +23,13 @@ class SideBySide:
     and states that it leads to, (B,). Where that is None, too, it is refused.
     """
 
-    def __init__(
-        self,
-        envs: Sequence[Any],
-        shape: Shape,
-        max_steps: int,
-        early_ends: str = "refuse",
-        cost: Cost | None = None,
-        charge: Charge | None = None,
-    ):
-        self.envs = envs
-        self.shape = shape
-        self.max_steps = max_steps
-        self.early_ends = early_ends
-        self.cost = cost
-        self.charge = charge
-        self.episodes: list[Episode] = []
+    envs: Sequence[Any]
+    shape: Shape
+    max_steps: int
+    early_ends: str = "refuse"
+    cost: Cost | None = None
+    charge: Charge | None = None
+    episodes: list[Episode] = field(default_factory=list)
 
     @property
     def running(self) -> np.ndarray:

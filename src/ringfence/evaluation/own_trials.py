@@ -81,7 +81,7 @@ class Own:
             play_all(player, env, range(first, first + count), key, bar, episodes, watch)
         steps = sum(len(episode.rewards) for episode in episodes)
         infeasible = sum(episode.counts["infeasible"] for episode in episodes)
-        violated = np.array([sum(float(np.max(cost)) for cost in episode.costs) > 0 for episode in episodes])
+        violated = np.array([episode.team_costs.any() for episode in episodes])
         return Trials(violated, np.concatenate([watch.shortfall() for watch in watches]), infeasible / max(steps, 1))
 
     @property

@@ -66,20 +66,18 @@ def recording(watches: Sequence[Places], episodes: Sequence[Episode]) -> Recordi
     if not kept:
         return {}
     steps = min(max(len(e.rewards) for *_, e in kept), LONGEST)
-    rewards = [np.array([reward.mean() for reward in e.rewards]) for *_, e in kept]
-    costs = [np.array([np.max(cost) for cost in e.costs]) for *_, e in kept]
     arrays = {
-        "places": np.stack([_filled(rows, steps + 1, np.nan) for rows, *_ in kept]),
+        "places": np.stack([filled(rows, steps + 1, np.nan) for rows, *_ in kept]),
         "resting": np.stack([resting for _, resting, _ in kept]),
-        "rewards": np.stack([_filled(one, steps, np.nan) for one in rewards]),
-        "costs": np.stack([_filled(one, steps, 0.0) for one in costs]),
+        "rewards": np.stack([filled(e.team_rewards, steps, np.nan) for *_, e in kept]),
+        "costs": np.stack([filled(e.team_costs, steps, 0.0) for *_, e in kept]),
     }
     if all(np.ndim(cost) for *_, e in kept for cost in e.costs):
-        arrays["agent_costs"] = np.stack([_filled(np.stack(e.costs), steps, 0.0) for *_, e in kept])
+        arrays["agent_costs"] = np.stack([filled(np.stack(e.costs), steps, 0.0) for *_, e in kept])
     return arrays
 
 
-def _filled(rows: np.ndarray, length: int, nothing: float) -> np.ndarray:
+def filled(rows: np.ndarray, length: int, nothing: float) -> np.ndarray:
     """So many rows: the first of these, or as many more of nothing."""
     rows = rows[:length]
     return np.concatenate([rows, np.full((length - len(rows), *rows.shape[1:]), nothing)])

@@ -17,7 +17,7 @@ from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_num
 from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
-from ringfence.evaluation.places import recording, watching
+from ringfence.evaluation.places import filled, recording, watching
 from ringfence.evaluation.player import HasPolicy, Player, RunPlayer, player_of
 from ringfence.evaluation.rollout import COUNTED, RESETS, Acting
 from ringfence.evaluation.simulators import name_of
@@ -315,12 +315,8 @@ def _arrays(played: list[Episode]) -> dict[str, np.ndarray]:
     """`rewards`, `costs` (E, L), `steps`, `terminated` (E,); nothing happens after an episode's end."""
     steps = np.array([len(e.rewards) for e in played])
     return {
-        "rewards": _padded([np.array([r.mean() for r in e.rewards]) for e in played], steps.max()),
-        "costs": _padded([np.array([np.max(c) for c in e.costs]) for e in played], steps.max()),
+        "rewards": np.stack([filled(e.team_rewards, steps.max(), 0.0) for e in played]),
+        "costs": np.stack([filled(e.team_costs, steps.max(), 0.0) for e in played]),
         "steps": steps,
         "terminated": np.array([e.terminated for e in played]),
     }
-
-
-def _padded(rows: list[np.ndarray], length: int) -> np.ndarray:
-    return np.stack([np.pad(row, (0, length - len(row))) for row in rows])

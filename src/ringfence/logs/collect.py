@@ -6,7 +6,7 @@ import itertools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -83,7 +83,7 @@ def collect(
     space = _space(env)
     shape = Shape(state=None if _has_state(env, seed) else 0, double=True)
     simulators = SideBySide([env], shape, max_episode_steps, early_ends, cost, _free)
-    keeper = _Keeper(env, space.bounds, source, card, file, kept)
+    keeper = _Keeper(env, space.bounds, source, card, file, kept, _skipped(kept))
     simulator = source["simulator"]
     begun = _begun(kept)
     with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
@@ -108,26 +108,18 @@ def _free(observations: np.ndarray, state: np.ndarray | None) -> np.ndarray:
     return np.zeros(len(observations))
 
 
+@dataclass(eq=False)
 class _Keeper:
     """What was collected so far: in a store, and since that was last kept."""
 
-    def __init__(
-        self,
-        env: Any,
-        bounds: Bounds,
-        source: dict[str, Any],
-        card: dict | None,
-        file: Path | None,
-        kept: EpisodeStore | None,
-    ):
-        self.env = env
-        self.bounds = bounds
-        self.source = source
-        self.card = card
-        self.file = file
-        self.kept = kept
-        self.skipped = 0 if kept is None else _skipped(kept)
-        self.fresh: list[_Played] = []
+    env: Any
+    bounds: Bounds
+    source: dict[str, Any]
+    card: dict | None
+    file: Path | None
+    kept: EpisodeStore | None
+    skipped: int
+    fresh: list[_Played] = field(default_factory=list)
 
     def add(self, played: _Played | None) -> None:
         """An episode, None of one that was skipped; every hundredth time all is written."""
@@ -164,9 +156,9 @@ def _begun(store: EpisodeStore | None) -> int:
     return 0 if store is None else store.episodes + _skipped(store)
 
 
-def _skipped(store: EpisodeStore) -> int:
+def _skipped(store: EpisodeStore | None) -> int:
     """Episodes that a collection left out."""
-    return int(store.card.extra.get("skipped_episodes", 0))
+    return 0 if store is None else int(store.card.extra.get("skipped_episodes", 0))
 
 
 @dataclass(frozen=True)

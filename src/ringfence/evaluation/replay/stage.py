@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.base import Outcome, Seed, Seen
-from ringfence.envs.rollout import Moment, rollout, split_off
+from ringfence.envs.rollout import Memoryless, Moment, rollout, split_off
 from ringfence.errors import UserError
 from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit
@@ -126,34 +126,29 @@ class Replayed:
         return self.velocity + change[self.windows.rows, self.windows.driven]
 
 
-class _Bad:
-    """A bad driver as a policy, under guard or not."""
+@dataclass(frozen=True, eq=False)
+class _Filtered:
+    """Somebody's actions (W, N, A) under guard, who reads none of what is observed."""
 
-    def __init__(self, name: str, env: Replayed, guard: Guarded | None):
-        self.wanted = DRIVERS[name]
-        self.env = env
-        self.guard = guard
+    actions: Callable[[], np.ndarray]
+    guard: Guarded
 
     def initial_state(self, batch: int) -> PyTree:
-        return {} if self.guard is None else self.guard.initial_state(batch)
+        return self.guard.initial_state(batch)
 
     def observe_cost(self, carry: PyTree, cost: Any) -> PyTree:
-        return carry if self.guard is None else self.guard.observe_cost(carry, cost)
+        return self.guard.observe_cost(carry, cost)
 
     def observe_age(self, carry: PyTree, age: Array) -> PyTree:
-        return carry if self.guard is None else self.guard.observe_age(carry, age)
+        return self.guard.observe_age(carry, age)
 
     def observe_sent(self, carry: PyTree, action: Array) -> PyTree:
-        return carry if self.guard is None else self.guard.observe_sent(carry, action)
+        return self.guard.observe_sent(carry, action)
 
     def act(self, carry: PyTree, observations: Any, state: Any, key: Array) -> tuple[PyTree, PolicyStep]:
-        env = self.env
-        team: Any = env.team(env.kinematics.toward(self.wanted(env.now), env.velocity, env.heading))
-        if self.guard is None:
-            return carry, PolicyStep(team, {})
-        world = self.guard.guard.world
-        present = _present(world, observations, state)
-        return _decided(self.guard, carry, present, held(in_unit(team, world), self.guard.guard.options.horizon), key)
+        guard = self.guard.guard
+        wanted = held(in_unit(self.actions(), guard.world), guard.options.horizon)
+        return _decided(self.guard, carry, _present(guard.world, observations, state), wanted, key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,19 +179,14 @@ class Stage:
         counts steps."""
         w = self.windows
         env = Replayed(w, self.kinematics, self.radius, brake)
-        if guard is not None:
-            guard = self._of_one(guard)
-        if guard is not None and not isinstance(driver, str):
-            driver = replace(guard, proposal=driver)
-        actor: Any = Acting(self._behind(_Bad(driver, env, guard) if isinstance(driver, str) else driver))
+        actor = Acting(self._behind(self._guarded(driver, env, guard)))
         rows = [env.motion]
-        contact = np.zeros(w.count, bool)
+        touches: list[np.ndarray] = []
         info: list[dict[str, np.ndarray]] = []
 
         def keep(now: Moment) -> None:
-            nonlocal contact
-            contact = contact | (now.outcome.cost > 0)
             rows.append(env.motion)
+            touches.append(now.outcome.cost > 0)
             told = {name: self._told(now.decided.info, name) for name in TOLD if name in now.decided.info}
             info.append({**told, **now.outcome.info})
             if bar is not None:
@@ -204,7 +194,8 @@ class Stage:
 
         rollout(actor, env, keep, split_off(jax.random.key(self.seed)))
         place, velocity, heading = (np.stack(each, 1) for each in zip(*rows))
-        return Driven(place, velocity, heading, contact, {k: np.stack([one[k] for one in info], 1) for k in info[0]})
+        told = {name: np.stack([one[name] for one in info], 1) for name in info[0]}
+        return Driven(place, velocity, heading, np.any(touches, 0), told)
 
     def scores(self, guard: Guard, driven: Driven) -> np.ndarray:
         """(W, L) of the steps that the driven agents took, as a guard's barrier has it."""
@@ -213,6 +204,18 @@ class Stage:
         x = jnp.stack([_present(guard.world, *w.observed(t, *moment)) for t, moment in enumerate(moments)], 1)
         scores = _scored(guard, x[:, :-1], x[:, 1:])
         return np.asarray(scores)[w.rows, :, w.driven]
+
+    def _guarded(self, driver: str | Policy, env: Replayed, guard: Guarded | None) -> Policy:
+        """Who decides: a bad driver or a policy, under guard if there is one."""
+        guard = None if guard is None else self._of_one(guard)
+        if not isinstance(driver, str):
+            return driver if guard is None else replace(guard, proposal=driver)
+
+        def wanted(*observed: Any) -> np.ndarray:
+            velocity = DRIVERS[driver](env.now)
+            return env.team(self.kinematics.toward(velocity, env.velocity, env.heading))
+
+        return Memoryless(wanted) if guard is None else _Filtered(wanted, guard)
 
     def _of_one(self, guard: Guarded) -> Guarded:
         """A team's guard, which is told whose actions it decides; agents who are alone decide their own anyway."""
