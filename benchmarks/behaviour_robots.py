@@ -9,6 +9,7 @@ The learner reads the global state in its critic, which one team needs once, sin
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from collections.abc import Callable
@@ -25,8 +26,8 @@ from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, BehaviourPolicy, save_behaviour
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.datasets.robots import Numbers, choose, file_of
-from ringfence.envs.base import Simulation
-from ringfence.envs.mujoco import Parts, SafeMuJoCo
+from ringfence.envs.mujoco import Parts, SafeMuJoCo, Simulation
+from ringfence.envs.rollout import Memoryless, rollout, split_off
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key
 
@@ -186,7 +187,7 @@ class Trainer:
             shape = (self.config.robots, self.env.n_agents, self.env.action_dim)
             return self.rng.uniform(-1, 1, shape).astype(np.float32)
         self.key, key = jax.random.split(self.key)
-        observations = self.sim.observe(state)
+        observations = self.sim.observe().observations
         return np.asarray(choose(self.learner.actors, observations, self.config.learner.noise, key))
 
     def _begin_again(self, over: np.ndarray) -> None:
@@ -239,16 +240,12 @@ def train(
 
 def returns(env: SafeMuJoCo, actors: Mlp, sim: Simulation, seed: int, noise: float = NOISE) -> np.ndarray:
     """(B,) returns of an episode of every robot."""
-    key = jax.random.key(seed + 1)
-    total = np.zeros(sim.batch)
+    rewards: list[np.ndarray] = []
+    explorer = Memoryless(lambda observations, state, key: choose(actors, observations, noise, key))
+    keys = itertools.islice(split_off(jax.random.key(seed + 1)), env.episode_length)
     sim.reset([(seed, 10**6 + episode) for episode in range(sim.batch)])
-    for _ in range(env.episode_length):
-        if not sim.running.any():
-            break
-        key, key_noise = jax.random.split(key)
-        action = choose(actors, sim.observe().astype(np.float32), noise, key_noise)
-        total += sim.step(np.asarray(action)).reward
-    return total
+    rollout(explorer, sim, lambda now: rewards.append(now.outcome.reward), keys)
+    return np.sum(rewards, 0)
 
 
 def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES, tiers: tuple[str, ...] = TIERS) -> dict[str, dict]:

@@ -25,7 +25,7 @@ from ringfence.datasets.make import make
 from ringfence.deploy import export
 from ringfence.evaluation import rollout
 from ringfence.loading.resolve import load
-from ringfence.proposals.base import act_with
+from ringfence.types import act_with
 
 OUT = RESULTS / "export.csv"
 TASK, OTHER, STATES, CLOSE = "simple_spread-expert", "simple_spread-medium-replay", 500, 1e-5

@@ -22,12 +22,11 @@ from ringfence.loading.resolve import load
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import draw
-from ringfence.proposals.base import act_with
 from ringfence.proposals.options import WIDE
 from ringfence.training import loop
 from ringfence.training.job import make_job
 from ringfence.training.runs import Run
-from ringfence.types import PolicyStep
+from ringfence.types import PolicyStep, act_with
 from ringfence.utils.config import build_config
 from tests.quick import QUICK_WORLD
 

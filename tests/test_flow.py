@@ -21,11 +21,10 @@ from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, at
-from ringfence.proposals.base import act_with
 from ringfence.proposals.guidance import guided
 from ringfence.proposals.options import PlanOptions, plan_defaults
 from ringfence.training import loop, worlds
-from ringfence.types import Spec
+from ringfence.types import Spec, act_with
 from tests.quick import QUICK_WORLD
 
 EPISODES, LENGTH = 200, 10

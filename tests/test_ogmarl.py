@@ -43,7 +43,7 @@ def recorded(parts: str, episodes: int = 3, length: int = 20, jump: bool = False
         out = sim.step(action)
         fallen |= out.terminated
         for k in np.flatnonzero(on):
-            rows[k].append((state[k], action[k], out.reward[k], out.cost[k], out.speed[k]))
+            rows[k].append((state[k], action[k], out.reward[k], out.cost[k], out.info["speed"][k]))
     lengths = np.array([len(r) for r in rows])
     state, action, reward, cost, speed = (np.stack(x) for x in zip(*[step for r in rows for step in r]))
     last = np.zeros(len(state), bool)

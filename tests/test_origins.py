@@ -17,8 +17,8 @@ from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation
-from ringfence.proposals.base import act_with
 from ringfence.training import loop
+from ringfence.types import act_with
 from tests.quick import QUICK_WORLD
 
 EAST, NORTH = 500_250.0, 4_649_776.0  # UTM, in metres

@@ -22,7 +22,7 @@ from ringfence.evaluation import stress
 from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.certify import certify
 from ringfence.evaluation.own_trials import Foresight
-from ringfence.evaluation.play import play_tables
+from ringfence.evaluation.play import play_all, simulators_of
 from ringfence.evaluation.player import player_of_run, shape_of
 from ringfence.evaluation.simulators import simulator
 from ringfence.faults import Faults
@@ -347,25 +347,22 @@ def test_what_was_foreseen_there_is_compared_with_what_came(guarded_run, small_w
     rows = []
 
     class Kept(Foresight):
-        def begin(self, observations, state):
-            rows.append(small_world.map(observations, state))
-            super().begin(observations, state)
+        def __call__(self, now):
+            rows.extend(small_world.map(*x) for x in ((now.after,) if rows else (now.before, now.after)))
+            self.last = now
+            super().__call__(now)
 
-        def step(self, info, counts, observations, state):
-            rows.append(small_world.map(observations, state))
-            super().step(info, counts, observations, state)
-
-    tables = []
     seen = Kept(guard, False)
     with Progress("", 2, 0, quiet=True) as bar:
         player = player_of_run(resolved, "test", Faults())
-        envs = [SimpleSpreadParallel() for _ in range(2)]
-        play_tables(tables, player, envs, range(2), None, jax.random.key(0), bar, watch_of=lambda: seen)
+        env = simulators_of(SimpleSpreadParallel, 2, player)
+        play_all(player, env, range(2), jax.random.key(0), bar, [], lambda: seen)
     expected = [guard.barrier.now(a, b).min((1, 2)) for a, b in zip(rows, rows[1:])]
     np.testing.assert_allclose(np.stack(seen.came, 1), np.stack(expected, 1), rtol=1e-5, atol=1e-5)
     lacking = np.maximum(np.stack(seen.foreseen, 1) - np.stack(seen.came, 1), 0).max(1)
     np.testing.assert_array_equal(seen.shortfall(), lacking)
-    seen.step({"next_clearance": np.full(2, 99.0)}, np.zeros(2, bool), *tables[0]._seen())
+    decided = seen.last.decided._replace(info={"next_clearance": np.full(2, 99.0)})
+    seen(seen.last._replace(decided=decided, outcome=seen.last.outcome._replace(shown=np.zeros(2, bool))))
     np.testing.assert_array_equal(seen.shortfall(), lacking, "after an episode's end nothing counts")
 
 

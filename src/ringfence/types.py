@@ -163,6 +163,17 @@ class Proposes(Policy, Protocol):
     ) -> tuple[PyTree, Array, dict[str, Array]]: ...
 
 
+def with_cost(policy: Policy, carry: PyTree, cost: Any) -> PyTree:
+    """The carry of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint; arrays
+    of NumPy or JAX."""
+    return policy.observe_cost(carry, cost) if isinstance(policy, ObservesCost) else carry
+
+
+def act_with(policy: Policy, carry: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
+    """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
+    return policy.act(carry, observations, state, key)
+
+
 @dataclass(frozen=True)
 class Algorithm:
     """An algorithm is a value: a name, a typed config and pure functions. No base class, no registry."""

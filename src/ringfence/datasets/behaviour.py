@@ -28,9 +28,10 @@ from safetensors.numpy import save_file
 
 from ringfence.datasets import matd3
 from ringfence.datasets.matd3 import Mlp
-from ringfence.envs.base import Env
+from ringfence.envs.base import PureEnv
+from ringfence.envs.rollout import scanned
 from ringfence.errors import CheckpointError, UserError, unknown
-from ringfence.types import Array, Key, PyTree
+from ringfence.types import Array, Key, PyTree, Transition
 from ringfence.utils.files import whole
 
 POLICIES = Path(__file__).parent / "policies"
@@ -105,7 +106,7 @@ def suffix(lineage: int) -> str:
 
 
 def collect(
-    env: Env, policy: BehaviourPolicy | Literal["random"], episodes: int, key: Key, batch: int = 2000
+    env: PureEnv, policy: BehaviourPolicy | Literal["random"], episodes: int, key: Key, batch: int = 2000
 ) -> dict[str, np.ndarray]:
     """Roll out `episodes` whole episodes, `batch` at a time; the result depends on `key` and `batch` alone.
 
@@ -129,7 +130,7 @@ def collect(
     return gather(chunk, episodes, batch)
 
 
-def resimulate(env: Env, initial: PyTree, actions: np.ndarray, batch: int = 2000) -> dict[str, np.ndarray]:
+def resimulate(env: PureEnv, initial: PyTree, actions: np.ndarray, batch: int = 2000) -> dict[str, np.ndarray]:
     """Play recorded actions (E, L, N, A) from recorded states (leading axis E); same arrays as `collect`."""
     episodes = len(actions)
     batch = min(batch, episodes)
@@ -144,7 +145,7 @@ def resimulate(env: Env, initial: PyTree, actions: np.ndarray, batch: int = 2000
 
 
 @partial(jax.jit, static_argnums=(0, 4))
-def _rollout_policy(env: Env, actors: Mlp | None, noise: Array, key: Key, batch: int) -> dict[str, Array]:
+def _rollout_policy(env: PureEnv, actors: Mlp | None, noise: Array, key: Key, batch: int) -> dict[str, Array]:
     key_reset, key = jax.random.split(key)
 
     def choose(state, key):
@@ -156,27 +157,23 @@ def _rollout_policy(env: Env, actors: Mlp | None, noise: Array, key: Key, batch:
 
 
 @partial(jax.jit, static_argnums=0)
-def _rollout_actions(env: Env, first: PyTree, actions: Array) -> dict[str, Array]:
+def _rollout_actions(env: PureEnv, first: PyTree, actions: Array) -> dict[str, Array]:
     return rollout(env, first, lambda _, action: action, jnp.swapaxes(actions, 0, 1))
 
 
-def rollout(env: Env, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
-    """Arrays (B, L, ...) of episodes from `first`, under actions `choose(state, x)`, x along the first axis of `xs`."""
+def rollout(env: PureEnv, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
+    """Arrays (B, L, ...) of the episodes that `envs.rollout.scanned` plays."""
+    return logged(env, *scanned(env, first, choose, xs))
 
-    def step(state, x):
-        action = choose(state, x)
-        after, transition = env.step(state, action)
-        return after, (after, action, transition.reward, transition.cost)
 
-    _, (after, *rest) = jax.lax.scan(step, first, xs)
-    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
-    actions, rewards, costs = (jnp.swapaxes(x, 0, 1) for x in rest)
+def logged(env: PureEnv, states: PyTree, actions: Array, transitions: Transition) -> dict[str, Array]:
+    """What logs hold of episodes (B, L, ...)."""
     return {
         "observations": jax.vmap(env.observe, 1, 1)(states),
         "state": jax.vmap(env.global_state, 1, 1)(states),
         "actions": actions,
-        "rewards": rewards,
-        "costs": costs,
+        "rewards": transitions.reward,
+        "costs": transitions.cost,
     }
 
 
@@ -195,7 +192,7 @@ def gather(chunk: Callable[[int], dict[str, Array]], episodes: int, batch: int) 
     return out
 
 
-def _check_actors(env: Env, actors: Mlp) -> None:
+def _check_actors(env: PureEnv, actors: Mlp) -> None:
     wanted = (env.n_agents, env.observation_dim, env.action_dim)
     found = (*actors.weights[0].shape[:2], actors.weights[-1].shape[-1])
     if found != wanted:

@@ -8,7 +8,7 @@ from typing import TypedDict
 from ringfence.datasets.recipes import crossing, proving, robots, spread, spread_alike
 from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike, System
-from ringfence.envs.base import Env, NativeEnv
+from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.envs.crossing import Body
 from ringfence.envs.mujoco import COST_LIMIT, Parts
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
@@ -286,7 +286,7 @@ def from_store(store: EpisodeStore) -> Task:
     )
 
 
-def _misfit(store: EpisodeStore, env: Env | NativeEnv) -> str:
+def _misfit(store: EpisodeStore, env: PureEnv | NativeEnv) -> str:
     """Where a store's arrays are not those of the simulator, in words; empty where they are."""
     sizes = (
         ("agents", store.n_agents, env.n_agents),

@@ -21,7 +21,8 @@ import numpy as np
 from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, resimulate, suffix
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
-from ringfence.envs.base import Env
+from ringfence.envs.base import PureEnv
+from ringfence.envs.rollout import scanned
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key, PyTree
@@ -51,7 +52,7 @@ class _Memory(NamedTuple):
 
 
 def train_behaviour(
-    env: Env,
+    env: PureEnv,
     config: MATD3Config,
     key: Key,
     transitions: int,
@@ -147,13 +148,13 @@ def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
 
 
 @partial(jax.jit, static_argnums=(0, 1))  # dozens of small arrays: one compilation instead of one for each operation
-def _init_learner(env: Env, config: MATD3Config, key: Key) -> Learner:
+def _init_learner(env: PureEnv, config: MATD3Config, key: Key) -> Learner:
     n = env.n_agents
     width = env.observation_dim
     return matd3.init(config, key, n, width, n * width, env.action_dim)
 
 
-def _empty_memory(env: Env, episodes: int) -> _Memory:
+def _empty_memory(env: PureEnv, episodes: int) -> _Memory:
     length = env.episode_length
     n = env.n_agents
     state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
@@ -167,7 +168,7 @@ def _empty_memory(env: Env, episodes: int) -> _Memory:
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
 def _train_rounds(
-    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
+    env: PureEnv, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
 ) -> tuple[Learner, _Memory, Array]:
     """For every round: one episode in each environment, then the updates. Returns the rounds' mean returns too."""
 
@@ -199,27 +200,24 @@ def _train_rounds(
     return learner, memory, scores
 
 
-def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
+def _explore(env: PureEnv, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
     """One episode in each of the config's environments, laid out as the buffer's rows."""
     key_reset, key = jax.random.split(key)
     first = env.reset(key_reset, config.envs)
 
-    def step(state, key):
+    def choose(state: PyTree, key: Key) -> Array:
         key_noise, key_uniform = jax.random.split(key)
         action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, key_noise)
         action = jnp.where(uniform, jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0), action)
         # Executed at half precision, so that a replay file of half the size repeats the run exactly.
-        action = action.astype(jnp.float16).astype(jnp.float32)
-        after, transition = env.step(state, action)
-        return after, (after, action, transition.reward, transition.terminated)
+        return action.astype(jnp.float16).astype(jnp.float32)
 
-    _, (after, actions, rewards, terminated) = jax.lax.scan(step, first, jax.random.split(key, env.episode_length))
-    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
-    return _Memory(states, *(jnp.swapaxes(x, 0, 1) for x in (actions, rewards, terminated)))
+    states, actions, out = scanned(env, first, choose, jax.random.split(key, env.episode_length))
+    return _Memory(states, actions, out.reward, out.terminated)
 
 
 def _update(
-    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
+    env: PureEnv, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
 ) -> Learner:
     """One critic update and, if `act`, one update of actors and targets."""
     key_rows, key_noise = jax.random.split(key)

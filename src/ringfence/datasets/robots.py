@@ -7,8 +7,10 @@ which the files under `policies/` are chosen.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, BehaviourPolicy, load_behaviour
 from ringfence.datasets.matd3 import Mlp
 from ringfence.envs.mujoco import SafeMuJoCo
+from ringfence.envs.rollout import Memoryless, Moment, rollout, split_off
 from ringfence.types import Array, Key
 
 Numbers = np.ndarray | Array
@@ -60,33 +63,33 @@ def _episodes(
     rng = np.random.default_rng(seed)
     key = jax.random.key(int(rng.integers(2**31)))
     sim.reset([(*seed, k) for k in range(batch)])
-    rows, running = [], []
-    for _ in range(env.episode_length):
-        if not sim.running.any():
-            break
-        state = sim.state().astype(np.float32)
+    rows: list[dict[str, Any]] = []
+
+    def act(observations: np.ndarray, state: np.ndarray | None, key: Key | None) -> Numbers:
         if policy is None:
-            action = rng.uniform(-1, 1, (batch, env.n_agents, env.action_dim)).astype(np.float32)
-        else:
-            key, key_noise = jax.random.split(key)
-            action = np.asarray(choose(policy.actors, sim.observe(state), policy.noise, key_noise))
-        running.append(sim.running.copy())
-        outcome = sim.step(action)
+            return rng.uniform(-1, 1, (batch, env.n_agents, env.action_dim)).astype(np.float32)
+        return choose(policy.actors, observations, policy.noise, key)
+
+    def keep(now: Moment) -> None:
         rows.append(
             {
-                "state": state,
-                "actions": action,
-                "rewards": outcome.reward.astype(np.float32),
-                "costs": outcome.cost.astype(np.float32),
-                "speed": outcome.speed,
-                "ended": outcome.terminated,
+                "state": now.before.state,
+                "actions": np.asarray(now.decided.action),
+                "rewards": now.outcome.reward.astype(np.float32),
+                "costs": now.outcome.cost.astype(np.float32),
+                "speed": now.outcome.info["speed"],
+                "ended": now.outcome.terminated,
+                "alive": now.running,
             }
         )
-    alive = np.stack(running, 1)  # (B, T)
+
+    rollout(Memoryless(act), sim, keep, itertools.islice(split_off(key), env.episode_length))
+    played = {name: np.stack([row[name] for row in rows], 1) for name in rows[0]}  # (B, T, ...)
+    alive = played.pop("alive")
     lengths = alive.sum(1)
-    flat = {name: np.stack([row[name] for row in rows], 1)[alive] for name in rows[0]}
+    flat = {name: value[alive] for name, value in played.items()}
     terminated = flat.pop("ended")[np.cumsum(lengths) - 1]
-    return {**flat, "lengths": lengths, "final_state": sim.state().astype(np.float32), "terminated": terminated}
+    return {**flat, "lengths": lengths, "final_state": np.asarray(sim.observe().state), "terminated": terminated}
 
 
 def shipped_policies(env: SafeMuJoCo, tier: str, folder: Path = POLICIES) -> list[BehaviourPolicy]:

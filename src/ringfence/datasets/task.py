@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.envs.base import Env, NativeEnv
+from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
@@ -54,7 +54,7 @@ class Task:
     (c + cost_offset)/(cost_limit + cost_offset), both per episode."""
 
     name: str
-    env: Env | NativeEnv | None  # None: a task that exists only as data
+    env: PureEnv | NativeEnv | None  # None: a task that exists only as data
     hazard: constraints.Hazard
     tier: str = ""
     return_min: float = 0.0
@@ -71,7 +71,7 @@ class Task:
     homogeneous: bool = False  # its agents are homogeneous and see for themselves (problem/homogeneous.py)
 
     @property
-    def simulator(self) -> Env | NativeEnv:
+    def simulator(self) -> PureEnv | NativeEnv:
         """Its simulator; `UserError` where the task exists only as data."""
         if self.env is None:
             raise UserError(f"Task '{self.name}' exists only as data, so it has no simulator; play in one of your own.")

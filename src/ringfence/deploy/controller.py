@@ -23,12 +23,11 @@ from ringfence.guards.wrap import Callback, guarded_of, under_guard, with_guarde
 from ringfence.loading.resolve import load
 from ringfence.problem.constraints import Hazard
 from ringfence.problem.homogeneous import PerAgent, team_policy
-from ringfence.proposals.base import act_with, with_cost
 from ringfence.proposals.options import DEFAULT
 from ringfence.training import worlds
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
-from ringfence.types import Key, Policy, PolicyStep, PyTree
+from ringfence.types import Key, Policy, PolicyStep, PyTree, act_with, with_cost
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import given_as, refuse_other_order
 from ringfence.utils.precision import in_float32

@@ -18,9 +18,8 @@ from ringfence.deploy.jaxpr import Interpreter, bind, draws, live, value, values
 from ringfence.errors import UserError
 from ringfence.guards import Guarded
 from ringfence.problem.homogeneous import agent_policy
-from ringfence.proposals.base import with_cost
 from ringfence.training.job import Job
-from ringfence.types import Array, Key, Policy, Spec
+from ringfence.types import Array, Key, Policy, Spec, with_cost
 from ringfence.utils.pytrees import named_leaves
 
 SEEN = ("observations", "state")  # inputs that have to be finite; a cost is NaN where nobody knows it

@@ -1,4 +1,5 @@
-"""What a simulator is: pure JAX (`Env`), or one that steps outside JAX (`NativeEnv`).
+"""What a simulator is: pure JAX (`PureEnv`), or one that steps outside JAX (`NativeEnv`); and episodes under way, of
+whatever steps outside JAX (`Env`).
 
 Tasks, data sets, evaluation and films ask nothing else of a simulator.
 """
@@ -15,6 +16,8 @@ from ringfence.types import Array, Key, PyTree, Transition
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+
+Seed = int | Sequence[int]
 
 
 class Simulator(Protocol):
@@ -81,8 +84,8 @@ class Defaults:
         return {}
 
 
-class Env(Simulator, Protocol):
-    """A batched simulator. States are pytrees with a leading B axis; all methods are pure and may be jitted."""
+class PureEnv(Simulator, Protocol):
+    """A simulator in JAX. States are pytrees with a leading B axis; all methods are pure and may be jitted."""
 
     def reset(self, key: Key, batch: int) -> PyTree: ...
 
@@ -114,31 +117,41 @@ class Measured(Protocol):
         ...
 
 
+class Seen(NamedTuple):
+    """What is observed of B episodes."""
+
+    observations: np.ndarray  # (B, N, O)
+    state: np.ndarray | None  # (B, S); None: there is none
+
+
 class Outcome(NamedTuple):
-    """What a step gives, for a batch of native simulations; what is not running has zeros."""
+    """What came of a step of B episodes; of one that was not running it does not count."""
 
-    reward: np.ndarray  # (B,) shared
-    cost: np.ndarray  # (B,) shared
+    reward: np.ndarray  # (B,) shared, or (B, N)
+    cost: Any  # (B,) shared, (B, N), or such by constraint, as policies observe it
     terminated: np.ndarray  # (B,) bool: the task itself ended
-    speed: np.ndarray  # (B,) m/s, what the cost is counted by
+    shown: np.ndarray  # (B,) bool: was running, and what is observed now is where the step led
+    info: Mapping[str, np.ndarray] = {}  # (B,) each: what else there is to know, e.g. a robot's `speed` (m/s)
 
 
-class Simulation(Protocol):
-    """A batch of native simulations under way. Not pure: `reset` and `step` change it."""
+class Env(Protocol):
+    """B episodes under way, side by side, outside JAX. Not pure: `reset` and `step` change it."""
 
-    batch: int
-    running: np.ndarray  # (B,) bool
-
-    def reset(self, seeds: Sequence[int | Sequence[int]], ids: Sequence[int] | np.ndarray | None = None) -> None: ...
-
-    def step(self, action: np.ndarray) -> Outcome: ...
-
-    def state(self) -> np.ndarray:
-        """(B, S) float64 global states."""
+    @property
+    def running(self) -> np.ndarray:
+        """(B,) bool: not ended."""
         ...
 
-    def observe(self, state: np.ndarray | None = None) -> np.ndarray:
-        """(B, N, O) local observations, of the present or of given global states."""
+    def reset(self, seeds: Sequence[Any]) -> None:
+        """Begin an episode for each seed, which fixes its start, whatever the others are."""
+        ...
+
+    def observe(self) -> Seen:
+        """What policies see now; of an episode that has ended, what was last seen."""
+        ...
+
+    def step(self, action: np.ndarray) -> Outcome:
+        """Advance what is running by joint actions (B, N, A)."""
         ...
 
 
@@ -146,7 +159,7 @@ class Simulation(Protocol):
 class NativeEnv(Simulator, Protocol):
     """A simulator that steps outside JAX."""
 
-    def simulate(self, batch: int, threads: int | None = None) -> Simulation:
+    def simulate(self, batch: int, threads: int | None = None) -> Env:
         """`batch` episodes side by side."""
         ...
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -93,6 +94,8 @@ class Episode:
         self.terminated = False
         self.unsafe_start = False
         self.told: set[str] = set()  # what infos tell that have no cost
+        self.charged = False  # some step told its cost
+        self.counts = Counter[str]()  # steps in which a guard failed, or did not know
         self.running = True
         self.showed_end = True
         begun = env.reset(seed=seed)
@@ -134,6 +137,16 @@ class Episode:
     def over(self) -> bool:
         """It has ended, and nothing is missing of its last step."""
         return not self.running and (self.skipped or not self.lacks_cost)
+
+    @property
+    def team_rewards(self) -> np.ndarray:
+        """(L,) the mean over agents."""
+        return np.array([reward.mean() for reward in self.rewards])
+
+    @property
+    def team_costs(self) -> np.ndarray:
+        """(L,) the largest of the agents' costs."""
+        return np.array([np.max(cost) for cost in self.costs])
 
     def charge(self, cost: float) -> None:
         """Set the cost of the last step, if nothing has."""
@@ -216,6 +229,7 @@ class Episode:
                 f"Step {len(self.rewards)} of {self.name} tells one cost, those before several; name them all."
             )
         self.costs.append(self._of_agents(charged, "cost=" if cost is not None else self.name))
+        self.charged = True
 
     def _take_constraints(self, costs: Mapping[Any, Any]) -> None:
         """The step's cost by each constraint's name."""

@@ -34,8 +34,7 @@ class Spread(_Parallel):
         self.theirs = simple_spread_v3.parallel_env(
             N=core.n_agents, max_cycles=core.episode_length, continuous_actions=True
         )
-        super().__init__(core.n_agents, core.observation_dim, core.action_dim, len(core.state_names), np.float32)
-        self.agents = []
+        super().__init__(core, np.float32)
 
     def reset(self, seed: int | None = None, options: dict | None = None):
         seen, infos = self.theirs.reset(seed=seed)

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs import film
-from ringfence.envs.base import Outcome
+from ringfence.envs.base import Outcome, Seed, Seen
 from ringfence.errors import UserError, unknown
 from ringfence.problem.features import VIEWS, FeatureMap, Source
 from ringfence.problem.others import others
@@ -48,7 +48,6 @@ COST_LIMIT = 25.0  # steps above the speed limit per episode, Safety-Gymnasium's
 CREEPING = 0.6  # m/s: below that limit a guard pushes an Ant less
 
 Parts = Literal["2x3", "2x4", "4x2"]
-Seed = int | Sequence[int]
 ROBOTS: dict[Parts, str] = {"2x3": "half_cheetah", "2x4": "ant", "4x2": "ant"}
 
 
@@ -321,9 +320,10 @@ class Simulation:
         first = 2 if self.env.ant else 1
         return np.concatenate([self._robots.qpos[:, first:], self._robots.qvel], 1)
 
-    def observe(self, state: np.ndarray | None = None) -> np.ndarray:
-        """(B, N, O) local observations."""
-        return (self.state() if state is None else state)[:, self.env.observed]
+    def observe(self) -> Seen:
+        """What policies see, in single precision."""
+        state = self.state().astype(np.float32)
+        return Seen(state[:, self.env.observed], state)
 
     def step(self, action: np.ndarray) -> Outcome:
         """Advance the running robots by 0.05 s; `action` (B, N, A) is clipped to [-1, 1]."""
@@ -353,7 +353,8 @@ class Simulation:
             reward=np.where(on, reward, 0.0),
             cost=np.where(on, cost, 0.0),
             terminated=on & ~sound,
-            speed=np.where(on, speed, 0.0),
+            shown=on,
+            info={"speed": np.where(on, speed, 0.0)},
         )
 
     def _sound(self) -> np.ndarray:

@@ -22,10 +22,9 @@ from ringfence.errors import UserError
 LANDMARK_RADIUS = 0.05
 FRAME_SIZE = 480  # pixels, both sides
 
-Reset = tuple[dict[str, np.ndarray], dict[str, dict[str, float]]]  # observations, infos
-Step = tuple[  # observations, rewards, terminations, truncations, infos
-    dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]
-]
+Infos = dict[str, dict[str, float]]
+Reset = tuple[dict[str, np.ndarray], Infos]
+Step = tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], Infos]
 
 
 def parallel_env(render_mode: str | None = None, **options: Any) -> SimpleSpreadParallel:
@@ -34,16 +33,19 @@ def parallel_env(render_mode: str | None = None, **options: Any) -> SimpleSpread
 
 
 class _Parallel(ParallelEnv):
-    """Agents `agent_0` .. `agent_{N-1}` and their spaces."""
+    """Agents `agent_0` .. `agent_{N-1}` of a simulator `core`, and their spaces."""
 
-    def __init__(self, agents: int, observation: int, action: int, state: int, kind: type):
-        names = [f"agent_{i}" for i in range(agents)]
+    def __init__(self, core: Any, kind: type):
+        names = [f"agent_{i}" for i in range(core.n_agents)]
+        seen = (core.observation_dim,)
+        self.core = core
         self.possible_agents = names
         self.agents: list[str] = []
+        self._steps = 0
         # One object per agent, made once: the API demands identity, so that seeding a space lasts.
-        self.observation_spaces = {agent: spaces.Box(-np.inf, np.inf, (observation,), kind) for agent in names}
-        self.action_spaces = {agent: spaces.Box(-1.0, 1.0, (action,), np.float32) for agent in names}
-        self.state_space = spaces.Box(-np.inf, np.inf, (state,), kind)
+        self.observation_spaces = {agent: spaces.Box(-np.inf, np.inf, seen, kind) for agent in names}
+        self.action_spaces = {agent: spaces.Box(-1.0, 1.0, (core.action_dim,), np.float32) for agent in names}
+        self.state_space = spaces.Box(-np.inf, np.inf, (len(core.state_names),), kind)
 
     def observation_space(self, agent: str) -> spaces.Space:
         return self.observation_spaces[agent]
@@ -53,6 +55,25 @@ class _Parallel(ParallelEnv):
 
     def close(self) -> None:
         """Nothing to release."""
+
+    def _begun(self, infos: Infos) -> Reset:
+        """What `reset` gives."""
+        self._steps = 0
+        self.agents = self.possible_agents[:]
+        return self._observations(), infos
+
+    def _stepped(self, reward: np.ndarray, terminated: bool, infos: Infos) -> Step:
+        """What `step` gives, by rewards (N,)."""
+        self._steps += 1
+        agents = self.agents
+        over = bool(self._steps >= self.core.episode_length)
+        if over or terminated:
+            self.agents = []
+        rewards = {agent: float(r) for agent, r in zip(agents, reward)}
+        return self._observations(), rewards, dict.fromkeys(agents, terminated), dict.fromkeys(agents, over), infos
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        raise NotImplementedError
 
 
 class _Plane(_Parallel):
@@ -65,12 +86,10 @@ class _Plane(_Parallel):
     def __init__(self, core: Any, render_mode: str | None):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"There is no render_mode='{render_mode}'; use 'rgb_array', or None to draw nothing.")
-        self.core = core
-        super().__init__(core.n_agents, core.observation_dim, 2, len(core.state_names), np.float32)
+        super().__init__(core, np.float32)
         self.render_mode = render_mode
         self._key: jax.Array | None = None
         self._state: Any = None
-        self._steps = 0
         self._reset = jax.jit(lambda key: core.reset(key, 1))
         self._step = jax.jit(core.step)
         self._observe = jax.jit(core.observe)
@@ -83,9 +102,7 @@ class _Plane(_Parallel):
             self._key = jax.random.key(int(entropy))
         self._key, key = jax.random.split(self._key)
         self._state = self._reset(key)
-        self._steps = 0
-        self.agents = self.possible_agents[:]
-        return self._observations(), self._infos(np.zeros(1))
+        return self._begun(self._infos(np.zeros(1)))
 
     def step(self, actions: dict[str, Any]) -> Step:
         """Advance by 0.1 s with one action (2,) per agent."""
@@ -93,20 +110,7 @@ class _Plane(_Parallel):
         if joint.shape[2:] != (2,) or not np.isfinite(joint).all():
             raise UserError(f"step() got actions {dict(actions)}; give every agent two finite numbers, its push.")
         self._state, transition = self._step(self._state, joint)
-        self._steps += 1
-        agents = self.agents
-        over = bool(self._steps >= self.core.episode_length)
-        reward = np.asarray(transition.reward)[0]
-        result = (
-            self._observations(),
-            {agent: float(r) for agent, r in zip(agents, reward)},
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, over),
-            self._infos(np.asarray(transition.cost[0])),
-        )
-        if over:
-            self.agents = []
-        return result
+        return self._stepped(np.asarray(transition.reward)[0], False, self._infos(np.asarray(transition.cost[0])))
 
     def state(self) -> np.ndarray:
         """(S,) float32; see the simulator's `state_names`."""
@@ -118,7 +122,7 @@ class _Plane(_Parallel):
         observations = np.asarray(self._observe(self._state)[0], np.float32)
         return dict(zip(self.possible_agents, observations))
 
-    def _infos(self, cost: np.ndarray) -> dict[str, dict[str, float]]:
+    def _infos(self, cost: np.ndarray) -> Infos:
         """Costs () of the team, or (N,) of each agent."""
         costs = np.broadcast_to(cost, len(self.possible_agents))
         facts = zip(self.possible_agents, costs, self._clearance())
@@ -208,17 +212,9 @@ class SafeMuJoCoParallel(_Parallel):
         if render_mode is not None:
             raise UserError(f"There is no render_mode='{render_mode}' of robots; `ringfence eval --video` films them.")
         self.render_mode = None
-        self.core = SafeMuJoCo(**options)
-        super().__init__(
-            self.core.n_agents,
-            self.core.observation_dim,
-            self.core.action_dim,
-            len(self.core.state_names),
-            np.float64,
-        )
+        super().__init__(SafeMuJoCo(**options), np.float64)
         self._sim = self.core.simulate(1, threads=1)
         self._seeds: np.random.SeedSequence | None = None
-        self._steps = 0
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Reset:
         """Start an episode; a seed fixes this one, as in safety-gymnasium, and all later ones."""
@@ -231,27 +227,13 @@ class SafeMuJoCoParallel(_Parallel):
         else:
             start = self._seeds.spawn(1)[0].generate_state(4).tolist()
         self._sim.reset([start])
-        self._steps = 0
-        self.agents = self.possible_agents[:]
-        return self._observations(), self._infos(cost=0.0, speed=0.0)
+        return self._begun(self._infos(cost=0.0, speed=0.0))
 
     def step(self, actions: dict[str, Any]) -> Step:
         """Advance by 0.05 s with one action (A,) per agent."""
         out = self._sim.step(_joint(self.agents, actions))
-        self._steps += 1
-        agents = self.agents
-        fallen = bool(out.terminated[0])
-        over = self._steps >= self.core.episode_length
-        result = (
-            self._observations(),
-            dict.fromkeys(agents, float(out.reward[0])),
-            dict.fromkeys(agents, fallen),
-            dict.fromkeys(agents, over),
-            self._infos(cost=float(out.cost[0]), speed=float(out.speed[0])),
-        )
-        if over or fallen:
-            self.agents = []
-        return result
+        infos = self._infos(cost=float(out.cost[0]), speed=float(out.info["speed"][0]))
+        return self._stepped(np.broadcast_to(out.reward, self.core.n_agents), bool(out.terminated[0]), infos)
 
     def state(self) -> np.ndarray:
         """(S,) see `SafeMuJoCo.state_names`."""
@@ -263,9 +245,9 @@ class SafeMuJoCoParallel(_Parallel):
         """Draws nothing; videos come from the report."""
 
     def _observations(self) -> dict[str, np.ndarray]:
-        return dict(zip(self.possible_agents, self._sim.observe()[0]))
+        return dict(zip(self.possible_agents, self._sim.state()[0, self.core.observed]))
 
-    def _infos(self, cost: float, speed: float) -> dict[str, dict[str, float]]:
+    def _infos(self, cost: float, speed: float) -> Infos:
         """What one body did, for every agent."""
         return {
             agent: {"cost": cost, "speed": speed, "clearance": self.core.limit - speed}

@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
-from ringfence.envs.base import Env, NativeEnv
+from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.types import Array, Policy
 from ringfence.utils.precision import in_float32
 
 WARM_UP = 10  # calls that are not counted
 
 
-def _first(env: Env | NativeEnv) -> tuple[Array, Array]:
+def _first(env: PureEnv | NativeEnv) -> tuple[Array, Array]:
     """What a policy sees at the start of an episode: (1, N, O), (1, S)."""
     if isinstance(env, NativeEnv):
         sim = env.simulate(1)
         sim.reset([0])
-        return jnp.asarray(sim.observe(), jnp.float32), jnp.asarray(sim.state(), jnp.float32)
+        return jnp.asarray(sim.observe().observations), jnp.asarray(sim.observe().state)
     state = env.reset(jax.random.key(0), 1)
     return env.observe(state), env.global_state(state)
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.episode import Cost
-from ringfence.evaluation.play import Table, play_tables, simulators_of
+from ringfence.envs.episode import Cost, Episode
+from ringfence.envs.rollout import Moment
+from ringfence.evaluation.play import play_all, simulators_of
 from ringfence.evaluation.player import player_of_run
 from ringfence.evaluation.rollout import FORESEEN, RESETS
 from ringfence.evaluation.simulators import name_of
@@ -19,7 +19,6 @@ from ringfence.evaluation.trials import Part, Trials, features, least_score, sho
 from ringfence.faults import Faults
 from ringfence.guards import Guard
 from ringfence.loading.resolve import Resolved
-from ringfence.types import Array
 from ringfence.utils.precision import float32
 from ringfence.utils.progress import Progress
 
@@ -33,33 +32,21 @@ class Foresight:
     def __init__(self, guard: Guard, homogeneous: bool):
         self.guard = guard
         self.homogeneous = homogeneous
-        self.before: Array | None = None
         self.foreseen: list[np.ndarray] = []
         self.came: list[np.ndarray] = []
 
-    def begin(self, observations: np.ndarray, state: np.ndarray | None) -> None:
-        """Episodes begin here."""
-        self.before = self._features(observations, state)
-
-    def step(
-        self, info: Mapping[str, Array], counts: np.ndarray, observations: np.ndarray, state: np.ndarray | None
-    ) -> None:
-        """What came of a step, where that counts (B,): the episode was running, and showed where it led."""
-        after = self._features(observations, state)
+    def __call__(self, now: Moment) -> None:
+        """What came of a step, if it was shown."""
         with float32():
-            came = np.asarray(least_score(self.guard, self.before, after))
-        self.foreseen.append(np.where(counts, np.asarray(info[FORESEEN]), -np.inf))
-        self.came.append(np.where(counts, came, np.inf))
-        self.before = after
+            before, after = (features(self.guard, self.homogeneous, *seen) for seen in (now.before, now.after))
+            came = np.asarray(least_score(self.guard, before, after))
+        self.foreseen.append(np.where(now.outcome.shown, np.asarray(now.decided.info[FORESEEN]), -np.inf))
+        self.came.append(np.where(now.outcome.shown, came, np.inf))
 
     def shortfall(self) -> np.ndarray:
         """(B,) as a certificate counts it."""
         foreseen, came = np.stack(self.foreseen, 1), np.stack(self.came, 1)
         return shortfall(foreseen, came, self.guard.options.delay)
-
-    def _features(self, observations: np.ndarray, state: np.ndarray | None) -> Array:
-        with float32():
-            return jnp.asarray(features(self.guard, self.homogeneous, observations, state))
 
 
 @dataclass(frozen=True)
@@ -79,10 +66,10 @@ class Own:
         split = "test" if part == "test" else "validation"
         player = player_of_run(resolved, split, self.faults)
         count = self.episodes[part]
-        envs = simulators_of(self.make_env, min(SIDE_BY_SIDE, count), player)
+        env = simulators_of(self.make_env, min(SIDE_BY_SIDE, count), player, self.cost)
         first = RESETS[split] + batch * count * (part == "calibration")
-        label = f"{part} in {type(envs[0]).__name__} behind {self.faults.name}, margin {guard.options.margin:.3g}"
-        tables: list[Table] = []
+        label = f"{part} in {type(env.envs[0]).__name__} behind {self.faults.name}, margin {guard.options.margin:.3g}"
+        episodes: list[Episode] = []
         watches: list[Foresight] = []
 
         def watch() -> Foresight:
@@ -91,20 +78,10 @@ class Own:
 
         key = jax.random.key(resolved.run.config["seed"] + batch)
         with Progress(label, count, 0, self.quiet) as bar:
-            play_tables(
-                tables,
-                player,
-                envs,
-                range(first, first + count),
-                self.cost,
-                key,
-                bar,
-                watch_of=watch,
-            )
-        episodes = [episode for table in tables for episode in table.episodes]
+            play_all(player, env, range(first, first + count), key, bar, episodes, watch)
         steps = sum(len(episode.rewards) for episode in episodes)
-        infeasible = sum(float(table.counted("infeasible").sum()) for table in tables)
-        violated = np.array([sum(float(np.max(cost)) for cost in episode.costs) > 0 for episode in episodes])
+        infeasible = sum(episode.counts["infeasible"] for episode in episodes)
+        violated = np.array([episode.team_costs.any() for episode in episodes])
         return Trials(violated, np.concatenate([watch.shortfall() for watch in watches]), infeasible / max(steps, 1))
 
     @property

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ringfence.envs.base import Seen
 from ringfence.envs.episode import Episode
+from ringfence.envs.rollout import Moment, Watch, nobody
 from ringfence.evaluation.recordings import Recording
 from ringfence.problem.names import Names
-from ringfence.types import Array
 
 EPISODES = 4  # that are kept
 LONGEST = 2000  # steps that are kept of each
@@ -24,35 +25,34 @@ class Places:
         self.rows: list[np.ndarray] = []  # (R, N, 2) each, nan where nobody showed it
         self.resting = np.zeros((0, 0, 2))  # (R, K, 2) goals, landmarks: what does not move by itself
 
-    def begin(self, observations: np.ndarray, state: np.ndarray | None) -> None:
-        """Episodes begin here."""
-        place = self._of(observations, state)
+    def __call__(self, now: Moment) -> None:
+        """Where a step led, if that was shown."""
+        if not self.rows:
+            self._begin(now.before)
+        if len(self.rows) <= LONGEST:
+            place = self._of(now.after)
+            self.rows.append(np.where(now.outcome.shown[: len(place), None, None], place, np.nan))
+
+    def _begin(self, seen: Seen) -> None:
+        place = self._of(seen)
         self.rows.append(place)
-        found = [place + observations[: len(place)][..., pair[:2]] for pair in self.names.resting]
+        found = [place + seen.observations[: len(place)][..., pair[:2]] for pair in self.names.resting]
         self.resting = np.concatenate([np.zeros((len(place), 0, 2)), *found], 1)
 
-    def step(
-        self, info: Mapping[str, Array], counts: np.ndarray, observations: np.ndarray, state: np.ndarray | None
-    ) -> None:
-        """Where a step led, where that counts (B,)."""
-        if len(self.rows) <= LONGEST:
-            place = self._of(observations, state)
-            self.rows.append(np.where(counts[: len(place), None, None], place, np.nan))
-
-    def _of(self, observations: np.ndarray, state: np.ndarray | None) -> np.ndarray:
+    def _of(self, seen: Seen) -> np.ndarray:
         """(R, N, 2)"""
-        place = self.names.place(observations[:EPISODES], None if state is None else state[:EPISODES])
+        place = self.names.place(seen.observations[:EPISODES], None if seen.state is None else seen.state[:EPISODES])
         assert place is not None, "asked before"
         return np.asarray(place[..., :2], np.float64)
 
 
-def watching(names: Names, count: int) -> tuple[list[Places], Callable[[], Places | None]]:
+def watching(names: Names, count: int) -> tuple[list[Places], Callable[[], Watch]]:
     """Who watches the first tables of `count` episodes each, until enough are kept; nobody watches the others."""
     watches: list[Places] = []
 
-    def watch() -> Places | None:
+    def watch() -> Watch:
         if len(watches) >= math.ceil(EPISODES / count) or names.place_is_unknown:
-            return None
+            return nobody
         watches.append(Places(names))
         return watches[-1]
 
@@ -66,20 +66,18 @@ def recording(watches: Sequence[Places], episodes: Sequence[Episode]) -> Recordi
     if not kept:
         return {}
     steps = min(max(len(e.rewards) for *_, e in kept), LONGEST)
-    rewards = [np.array([reward.mean() for reward in e.rewards]) for *_, e in kept]
-    costs = [np.array([np.max(cost) for cost in e.costs]) for *_, e in kept]
     arrays = {
-        "places": np.stack([_filled(rows, steps + 1, np.nan) for rows, *_ in kept]),
+        "places": np.stack([filled(rows, steps + 1, np.nan) for rows, *_ in kept]),
         "resting": np.stack([resting for _, resting, _ in kept]),
-        "rewards": np.stack([_filled(one, steps, np.nan) for one in rewards]),
-        "costs": np.stack([_filled(one, steps, 0.0) for one in costs]),
+        "rewards": np.stack([filled(e.team_rewards, steps, np.nan) for *_, e in kept]),
+        "costs": np.stack([filled(e.team_costs, steps, 0.0) for *_, e in kept]),
     }
     if all(np.ndim(cost) for *_, e in kept for cost in e.costs):
-        arrays["agent_costs"] = np.stack([_filled(np.stack(e.costs), steps, 0.0) for *_, e in kept])
+        arrays["agent_costs"] = np.stack([filled(np.stack(e.costs), steps, 0.0) for *_, e in kept])
     return arrays
 
 
-def _filled(rows: np.ndarray, length: int, nothing: float) -> np.ndarray:
+def filled(rows: np.ndarray, length: int, nothing: float) -> np.ndarray:
     """So many rows: the first of these, or as many more of nothing."""
     rows = rows[:length]
     return np.concatenate([rows, np.full((length - len(rows), *rows.shape[1:]), nothing)])

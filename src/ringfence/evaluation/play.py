@@ -5,29 +5,29 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
+from ringfence.envs.rollout import Moment, Watch, nobody, rollout, split_off
+from ringfence.envs.side_by_side import SideBySide
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
-from ringfence.evaluation import protocol, recordings, rollout
+from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
-from ringfence.evaluation.places import recording, watching
+from ringfence.evaluation.places import filled, recording, watching
 from ringfence.evaluation.player import HasPolicy, Player, RunPlayer, player_of
+from ringfence.evaluation.rollout import COUNTED, RESETS, Acting
 from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.names import Names
-from ringfence.proposals.base import with_cost
 from ringfence.training.runs import Run
-from ringfence.types import Array, Key
+from ringfence.types import Key
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
-from ringfence.utils.precision import float32
 from ringfence.utils.progress import Progress
 
 OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary that need a benchmark's constants
@@ -84,30 +84,30 @@ def play(
     player = player_of(run, planner, split, options, faults)
     if keep:
         _check_kept(player)
-    envs = simulators_of(make_env, min(num_envs, episodes), player)
+    env = simulators_of(make_env, min(num_envs, episodes), player, cost, max_episode_steps, early_ends)
+    first = env.envs[0]
     begun = time.perf_counter()
-    tables: list[Table] = []
-    watches, watch = watching(_names_of(player, envs[0]), len(envs)) if keep else ([], None)
+    played: list[Episode] = []
+    watches, watch_of = watching(_names_of(player, first), len(env.envs)) if keep else ([], lambda: nobody)
     try:
-        with Progress(f"{player.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
-            resets = range(rollout.RESETS[split], rollout.RESETS[split] + episodes)
-            key = jax.random.key(seed)
-            play_tables(tables, player, envs, resets, cost, key, bar, max_episode_steps, early_ends, watch)
+        with Progress(f"{player.name} in {type(first).__name__}", episodes, 0, quiet) as bar:
+            resets = range(RESETS[split], RESETS[split] + episodes)
+            play_all(player, env, resets, jax.random.key(seed), bar, played, watch_of)
     except UserError as error:
-        raise _with_finished(error, player, tables) from error
+        raise _with_finished(error, player, played) from error
     except KeyboardInterrupt as stopped:
-        raise _interrupted(player, tables, episodes) from stopped
-    summary = _summary(player, tables)
+        raise _interrupted(player, played, episodes) from stopped
+    summary = _summary(player, played)
     about = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.about
     about |= {"compensated": compensate} if faults.given else {}
     if keep and isinstance(player, RunPlayer):
-        simulator = name_of(make_env, envs[0])
+        simulator = name_of(make_env, first)
         of_file = {"split": split, "simulator": simulator, "num_envs": num_envs, "early_ends": early_ends}
         words = ["--env", simulator, "--episodes", episodes, "--num-envs", num_envs]
         words += [] if early_ends == "refuse" else ["--early-ends", early_ends]
         words += [*split_words(split), *player.spec.words]
         _add_to_run(player, summary | about | of_file | {"command": ["play", *map(str, words)]})
-        film = recording(watches, [episode for table in tables for episode in table.episodes])
+        film = recording(watches, played)
         recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}
     return shown | about | {"cost_limit": player.task.cost_limit}
@@ -123,7 +123,7 @@ def _check_sizes(episodes: int, num_envs: int, seed: int, max_episode_steps: int
 
 def _check_choices(early_ends: str, split: str) -> None:
     known("early_ends", early_ends, EARLY_ENDS)
-    if split not in rollout.RESETS:
+    if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
 
 
@@ -154,28 +154,28 @@ class PlayInterrupted(UserError):
         self.finished = finished
 
 
-def _with_finished(error: UserError, player: Player, tables: list[Table]) -> UserError:
+def _with_finished(error: UserError, player: Player, played: list[Episode]) -> UserError:
     """The refusal, with what was finished before."""
-    done = _done(tables)
+    done = _done(played)
     if not done:
         return error
     message = f"{str(error).rstrip('.')} ({done} episodes were finished; the refusal's `finished` has their summary)."
-    return PlayInterrupted(message, _summary(player, tables))
+    return PlayInterrupted(message, _summary(player, played))
 
 
-def _interrupted(player: Player, tables: list[Table], episodes: int) -> Interrupted:
+def _interrupted(player: Player, played: list[Episode], episodes: int) -> Interrupted:
     """Ctrl-C, with what was finished before."""
-    done = _done(tables)
+    done = _done(played)
     message = f"interrupted; {done} of {episodes} episodes were finished, and nothing was added to results.json"
     finished = None
     if done:
-        finished = {k: v for k, v in _summary(player, tables).items() if k not in OF_A_BENCHMARK} | player.about
+        finished = {k: v for k, v in _summary(player, played).items() if k not in OF_A_BENCHMARK} | player.about
     return Interrupted(message, finished)
 
 
-def _done(tables: list[Table]) -> int:
+def _done(played: list[Episode]) -> int:
     """Episodes that were played to their end."""
-    return sum(episode.over and not episode.skipped for table in tables for episode in table.episodes)
+    return sum(episode.over and not episode.skipped for episode in played)
 
 
 def _check_kept(player: Player) -> None:
@@ -214,7 +214,14 @@ def _check_bounds(env: Any, bounds: Bounds) -> None:
             )
 
 
-def simulators_of(make_env: Callable[[], Any], count: int, player: Player) -> list[Any]:
+def simulators_of(
+    make_env: Callable[[], Any],
+    count: int,
+    player: Player,
+    cost: Cost | None = None,
+    max_episode_steps: int | None = None,
+    early_ends: str = "refuse",
+) -> SideBySide:
     """So many simulators, each its own, in which the player can act."""
     if not callable(make_env):
         kind = type(make_env).__name__
@@ -226,136 +233,69 @@ def simulators_of(make_env: Callable[[], Any], count: int, player: Player) -> li
             "new one at every call, or pass num_envs=1."
         )
     _check_bounds(envs[0], Bounds(player.task.action_low, player.task.action_high))
-    return envs
+    max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
+    return SideBySide(envs, player.shape, max_steps, early_ends, cost, player.unsafe)
 
 
-def _warn_unless_repeated(one: Episode, again: Episode) -> None:
+def _warn_unless_repeated(env: SideBySide, seed: int) -> None:
     """Say so where two resets with the same seed begin differently."""
-    if not np.array_equal(one.seen, again.seen, equal_nan=True):
+    begun: list[np.ndarray] = []
+    for _ in range(2):
+        env.reset([seed])
+        begun.append(env.observe().observations)
+    if not np.array_equal(*begun, equal_nan=True):
         warnings.warn(
-            f"{one.name} begins differently at each reset(seed={one.seed}), so that no two policies are played from "
-            "the same starts; let its reset draw from that seed alone.",
+            f"{env.episodes[0].name} begins differently at each reset(seed={seed}), so that no two policies are played "
+            "from the same starts; let its reset draw from that seed alone.",
             stacklevel=4,
         )
 
 
-def play_tables(
-    tables: list[Table],
+def play_all(
     player: Player,
-    envs: list[Any],
+    env: SideBySide,
     resets: range,
-    cost: Cost | None,
     key: Key,
     bar: Progress,
-    max_episode_steps: int | None = None,
-    early_ends: str = "refuse",
-    watch_of: Callable[[], Watch | None] | None = None,
+    played: list[Episode],
+    watch_of: Callable[[], Watch] = lambda: nobody,
 ) -> None:
-    """Episodes of these resets, as many side by side as there are simulators. A table is among `tables` as soon as it
-    has begun, so that who interrupts it loses none of its episodes."""
-    max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
-    _warn_unless_repeated(*(Episode(envs[0], player.shape, resets[0], max_steps, early_ends) for _ in range(2)))
-    for first in range(0, len(resets), len(envs)):
-        beginning = zip(envs, resets[first : first + len(envs)])
-        begun = [Episode(env, player.shape, reset, max_steps, early_ends) for env, reset in beginning]
-        tables.append(Table(player, begun, watch_of() if watch_of else None))
-        key = tables[-1].play(cost, key)
-        bar.advance(len(begun))
-
-
-class Watch(Protocol):
-    """Who is shown every step of a table's B episodes."""
-
-    def begin(self, observations: np.ndarray, state: np.ndarray | None) -> None: ...
-
-    def step(
-        self, info: Mapping[str, Array], counts: np.ndarray, observations: np.ndarray, state: np.ndarray | None
-    ) -> None: ...
-
-
-class Table:
-    """B episodes that are stepped side by side, and what is counted of each."""
-
-    def __init__(self, player: Player, episodes: list[Episode], watch: Watch | None = None):
-        self.player = player
-        self.episodes = episodes
-        self.watch = watch
-        self.counts: dict[str, np.ndarray] = {}  # (B,) steps in which a guard failed, or did not know
+    """Episodes of these resets, as many at once as there are simulators. They are among `played` as soon as they have
+    begun, so that who interrupts it loses none."""
+    _warn_unless_repeated(env, resets[0])
+    acting = Acting(player.policy)
+    keys = split_off(key)
+    for first in range(0, len(resets), len(env.envs)):
+        env.reset(resets[first : first + len(env.envs)])
+        played.extend(env.episodes)
         if player.unsafe is not None:
-            for episode, unsafe in zip(episodes, player.unsafe(*self._seen())):
+            for episode, unsafe in zip(env.episodes, player.unsafe(*env.observe())):
                 episode.unsafe_start = bool(unsafe)
-
-    def play(self, cost: Cost | None, key: Key) -> Key:
-        """Play until all have ended; the key that is left over."""
-        policy = self.player.policy
-        with float32():
-            carry = policy.initial_state(len(self.episodes))
-        if self.watch is not None:
-            self.watch.begin(*self._seen())
-        while any(e.running for e in self.episodes):
-            key, now = jax.random.split(key)
-            carry, decided = self.player.act(policy, carry, *self._seen(), now)
-            self._count(decided.info)
-            running = np.array([e.running for e in self.episodes])
-            for episode, action in zip(self.episodes, np.asarray(decided.action)):
-                if episode.running:
-                    episode.step(action, cost)
-            if self.watch is not None:
-                shown = running & np.array([e.running or e.showed_end for e in self.episodes])
-                self.watch.step(decided.info, shown, *self._seen())
-            if any(e.lacks_cost for e in self.episodes if not e.skipped):
-                self._charge_by_formula()
-            with float32():
-                carry = with_cost(policy, carry, self._last_costs())
-        return key
-
-    def _seen(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """Observations (B, N, O) and states (B, S), or None without a state."""
-        states = [e.state for e in self.episodes if e.state is not None]
-        return np.stack([e.seen for e in self.episodes]), np.stack(states) if states else None
-
-    def _count(self, info: Mapping[str, Array]) -> None:
-        """Count what a guard says of the step that is about to be taken."""
-        running = np.array([e.running for e in self.episodes])
-        for name in rollout.COUNTED:
-            if name in info:
-                self.counts[name] = self.counted(name) + (np.asarray(info[name]) & running)
-
-    def counted(self, name: str) -> np.ndarray:
-        """(B,) steps of which a guard said so."""
-        return self.counts.get(name, np.zeros(len(self.episodes)))
-
-    def _charge_by_formula(self) -> None:
-        """The last step costs 1 where the run's hazard calls the state unsafe."""
-        if self.player.unsafe is None:
-            raise UserError(
-                "step() tells no cost, and no formula says of what the policy sees whether it is unsafe; pass cost=, a "
-                "function of the agents' infos."
-            )
-        for episode, unsafe in zip(self.episodes, self.player.unsafe(*self._seen())):
-            episode.charge(float(unsafe))
-
-    def _last_costs(self) -> Array | dict[str, Array]:
-        """(B,) what the last step of each cost, or that by constraint."""
-        named = [e.constraints[0] for e in self.episodes if e.constraints]
-        if not named:
-            return jnp.asarray([np.max(e.costs[-1]) if e.costs else 0.0 for e in self.episodes], jnp.float32)
-        nothing = dict.fromkeys(named[0], 0.0)  # of an episode that was skipped at its first step
-        last = [e.constraints[-1] if e.constraints else nothing for e in self.episodes]
-        return {k: jnp.asarray([np.max(costs[k]) for costs in last], jnp.float32) for k in nothing}
+        rollout(acting, env, _counting(env.episodes, watch_of()), keys)
+        bar.advance(len(env.episodes))
 
 
-def _summary(player: Player, tables: list[Table]) -> dict[str, Any]:
-    """The protocol's numbers of all episodes."""
-    begun = [episode for table in tables for episode in table.episodes]
+def _counting(episodes: list[Episode], watch: Watch) -> Watch:
+    """Who counts in which steps a guard failed, or did not know, before it is somebody else's turn to watch."""
+
+    def count(now: Moment) -> None:
+        for name in COUNTED:
+            if name in now.decided.info:
+                for episode, said in zip(episodes, np.asarray(now.decided.info[name]) & now.running):
+                    episode.counts[name] += int(said)
+        watch(now)
+
+    return count
+
+
+def _summary(player: Player, begun: list[Episode]) -> dict[str, Any]:
+    """The protocol's numbers of all episodes that are over."""
     every = [episode for episode in begun if episode.over]
-    counted = np.array([episode.over and not episode.skipped for episode in begun])
     played = [episode for episode in every if not episode.skipped]
     if not played:
         raise UserError(f"All {len(every)} episodes were skipped, since agents left them; pass early_ends='cut'.")
-    counts = {k: np.concatenate([t.counted(k) for t in tables])[counted] for k in tables[0].counts}
-    arrays = _arrays(played) | counts
-    summary = protocol.summarise(arrays, player.task, np.array([e.unsafe_start for e in played]))
+    counts = {k: np.array([e.counts[k] for e in played]) for k in played[0].counts}
+    summary = protocol.summarise(_arrays(played) | counts, player.task, np.array([e.unsafe_start for e in played]))
     if cut := sum(episode.was_cut for episode in played):
         summary["cut_episodes"] = cut
     if len(played) < len(every):
@@ -375,12 +315,8 @@ def _arrays(played: list[Episode]) -> dict[str, np.ndarray]:
     """`rewards`, `costs` (E, L), `steps`, `terminated` (E,); nothing happens after an episode's end."""
     steps = np.array([len(e.rewards) for e in played])
     return {
-        "rewards": _padded([np.array([r.mean() for r in e.rewards]) for e in played], steps.max()),
-        "costs": _padded([np.array([np.max(c) for c in e.costs]) for e in played], steps.max()),
+        "rewards": np.stack([filled(e.team_rewards, steps.max(), 0.0) for e in played]),
+        "costs": np.stack([filled(e.team_costs, steps.max(), 0.0) for e in played]),
         "steps": steps,
         "terminated": np.array([e.terminated for e in played]),
     }
-
-
-def _padded(rows: list[np.ndarray], length: int) -> np.ndarray:
-    return np.stack([np.pad(row, (0, length - len(row))) for row in rows])

@@ -24,7 +24,6 @@ from ringfence.problem import constraints
 from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import local_features
-from ringfence.proposals.base import act_with
 from ringfence.proposals.options import DEFAULT
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
@@ -51,7 +50,6 @@ class Player:
 
     name: str
     policy: Policy  # of the whole team
-    act: Callable[..., tuple[PyTree, PolicyStep]]  # proposals.base.act_with, compiled where the policy can be
     task: Task
     shape: Shape
     episode_length: int  # of the longest logged one
@@ -108,7 +106,6 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
     return RunPlayer(
         name=job.algorithm.name,
         policy=resolved.team,
-        act=in_float32(jax.jit(act_with)),
         task=job.task,
         shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins, names=resolved.run.agents),
         episode_length=job.spec.episode_length,
@@ -152,7 +149,6 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
     return Player(
         name="a function under guard",
         policy=_OneByOne(callback),
-        act=act_with,
         task=Task(spec.task, None, world.hazard, action_low=spec.action_low, action_high=spec.action_high),
         shape=shape_of(world, callback.agents),
         episode_length=spec.episode_length,

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.base import Env, NativeEnv, Outcome
+from ringfence.envs import rollout as outside
+from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.errors import UserError
 from ringfence.faults.policy import Faulty
-from ringfence.proposals.base import act_with, with_cost
-from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
+from ringfence.types import Array, Key, Policy, PolicyStep, PyTree, act_with, with_cost
+from ringfence.utils.precision import float32, in_float32
 from ringfence.utils.progress import Progress
 
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
@@ -24,11 +26,32 @@ FORESEEN = "next_clearance"  # by the guard: the least score of the state that i
 CUT = ("reward", "cost", "state", "violated", FORESEEN, *COUNTED, *SHARES)  # of as many episodes as were asked for
 
 Played = dict[str, np.ndarray]
+_compiled_act = in_float32(jax.jit(act_with))
+
+
+class Acting:
+    """A policy as `envs.rollout` plays it: compiled where it can be, and in 32 bits, whatever the precision of the
+    simulator. What JAX cannot take apart acts in its own."""
+
+    def __init__(self, policy: Policy):
+        self.policy = policy
+        self.act_with = act_with if _foreign(policy) else _compiled_act
+
+    def initial_state(self, batch: int) -> PyTree:
+        with float32():
+            return self.policy.initial_state(batch)
+
+    def act(self, carry: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
+        return self.act_with(self.policy, carry, observations, state, key)
+
+    def observe_cost(self, carry: PyTree, cost: Any) -> PyTree:
+        with float32():
+            return with_cost(self.policy, carry, cost)
 
 
 def rollout(
     policy: Policy,
-    env: Env | NativeEnv,
+    env: PureEnv | NativeEnv,
     episodes: int,
     split: str = "test",
     seed: int = 0,
@@ -70,7 +93,7 @@ def rollout(
 
 
 def _compiled(
-    env: Env, reset_key: Key, act_key: Key, foreseen: bool
+    env: PureEnv, reset_key: Key, act_key: Key, foreseen: bool
 ) -> Callable[[Policy, int, int, int], dict[str, Array]]:
     """A program that plays the chunk `index` of `batch` episodes and keeps what was drawn in the first `keep`."""
 
@@ -145,42 +168,31 @@ def _rollout_native(
     and costs are 0 and its state stays."""
     simulation = env.simulate(episodes)
     simulation.reset([(root, k) for k in range(episodes)])
-    act = act_with if _foreign(policy) else jax.jit(act_with)
-    carry = policy.initial_state(episodes)
-    states = [simulation.state().astype(np.float32)]
-    lengths = np.zeros(episodes, int)
-    outcomes: list[Outcome] = []
-    counted: list[Played] = []
+    seen = [simulation.observe()]
+    steps: list[dict[str, Any]] = []
     drawn: list[Played] = []
-    scores: list[np.ndarray] = []
+
+    def keep(now: outside.Moment) -> None:
+        seen.append(now.after)
+        kept = {"rewards": now.outcome.reward, "costs": now.outcome.cost, "terminated": now.outcome.terminated}
+        kept = {name: np.asarray(value) * now.running for name, value in (kept | _counted(now.decided)).items()}
+        if foreseen:
+            kept[FORESEEN] = np.where(now.running, np.asarray(now.decided.info[FORESEEN]), -np.inf)
+        steps.append(kept | {"steps": now.running})
+        if num_recorded:
+            drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(now.decided).items()})
+        bar.advance(1)
+
+    keys = (jax.random.fold_in(key, t) for t in range(env.episode_length))
     with Progress(label, env.episode_length, 0, quiet) as bar:
-        for t in range(env.episode_length):
-            if not simulation.running.any():
-                break
-            observations = simulation.observe(states[-1])
-            carry, decided = act(policy, carry, observations, states[-1], jax.random.fold_in(key, t))
-            running = simulation.running.copy()
-            lengths += running
-            outcomes.append(simulation.step(np.asarray(decided.action)))
-            states.append(simulation.state().astype(np.float32))
-            carry = with_cost(policy, carry, outcomes[-1].cost)
-            counted.append({name: np.asarray(value) * running for name, value in _counted(decided).items()})
-            if foreseen:
-                scores.append(np.where(running, np.asarray(decided.info[FORESEEN]), -np.inf))
-            if num_recorded:
-                drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(decided).items()})
-            bar.advance(1)
-    per_step = {
-        "rewards": np.stack([o.reward for o in outcomes], 1),
-        "costs": np.stack([o.cost for o in outcomes], 1),
-        **_stacked(counted),
-    }
+        outside.rollout(Acting(policy), simulation, keep, keys)
+    played = _stacked(steps)
+    states = np.stack([one.state for one in seen if one.state is not None], 1)  # robots have one
     return {
-        **{name: _padded(value, env.episode_length) for name, value in per_step.items()},
-        "steps": lengths,
-        "terminated": np.asarray(np.stack([o.terminated for o in outcomes], 1).any(1)),
-        "states": _held(np.stack(states, 1), env.episode_length + 1),
-        **({FORESEEN: _padded(np.stack(scores, 1), env.episode_length, -np.inf)} if foreseen else {}),
+        "steps": np.asarray(played.pop("steps").sum(1)),
+        "terminated": np.asarray(played.pop("terminated").any(1)),
+        "states": _held(states, env.episode_length + 1),
+        **{k: _padded(x, env.episode_length, -np.inf if k == FORESEEN else 0.0) for k, x in played.items()},
         **_stacked(drawn),
     }
 
@@ -199,7 +211,7 @@ def _foreign(policy: Policy) -> bool:
     return jax.tree_util.all_leaves([policy.policy if isinstance(policy, Faulty) else policy])
 
 
-def _stacked(steps: list[Played]) -> Played:
+def _stacked(steps: Sequence[dict[str, Any]]) -> Played:
     """Arrays (E, T, ...) of what every step kept; nothing of no steps."""
     return {name: np.stack([step[name] for step in steps], 1) for name in (steps[0] if steps else ())}
 

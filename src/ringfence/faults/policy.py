@@ -17,8 +17,7 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.faults.faults import Faults
-from ringfence.proposals.base import with_cost
-from ringfence.types import Array, Bound, Key, ObservesDelay, Policy, PolicyStep, PyTree
+from ringfence.types import Array, Bound, Key, ObservesDelay, Policy, PolicyStep, PyTree, with_cost
 
 EXACT = ("seen", "draw")  # entries that are no measurements, by the ends of their names
 OWN_KEY = 39  # folded into the policy's key, whose own draws stay what they are without faults

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
-from ringfence.envs.base import Env, Measured
+from ringfence.envs.base import Measured, PureEnv
 from ringfence.errors import UserError
 from ringfence.guards import BarrierSource, Guard, Guarded, GuardOptions, options_of
 from ringfence.guards.options import in_steps
@@ -31,7 +31,7 @@ DISCOUNT = 0.97  # of rewards, in a step
 
 
 @runtime_checkable
-class Known(Env, Measured, Protocol):
+class Known(PureEnv, Measured, Protocol):
     """A pure simulator that knows how far everybody is from danger, and how long a step takes."""
 
     @property

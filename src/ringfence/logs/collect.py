@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, is_vector, made
+from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, is_vector, made
 from ringfence.envs.padded import PaddedEnv
+from ringfence.envs.rollout import Memoryless, Moment, rollout
+from ringfence.envs.side_by_side import SideBySide
 from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
@@ -77,26 +80,17 @@ def collect(
     kept = _kept_before(file, source, episodes)
     if kept is not None and _begun(kept) >= episodes:
         return kept
-    rules = _Rules(
-        space=_space(env),
-        shape=Shape(state=None if _has_state(env, seed) else 0, double=True),
-        cost=cost,
-        max_steps=max_episode_steps,
-        early_ends=early_ends,
-    )
-    keeper = _Keeper(env, rules.space.bounds, source, card, file, kept)
-    return _filled(keeper, player, rules, episodes, quiet)
-
-
-def _filled(keeper: _Keeper, player: _Player, rules: _Rules, episodes: int, quiet: bool) -> EpisodeStore:
-    """The store, after what is missing of `episodes` was played."""
-    simulator = keeper.source["simulator"]
-    begun = _begun(keeper.kept)
+    space = _space(env)
+    shape = Shape(state=None if _has_state(env, seed) else 0, double=True)
+    simulators = SideBySide([env], shape, max_episode_steps, early_ends, cost, _free)
+    keeper = _Keeper(env, space.bounds, source, card, file, kept, _skipped(kept))
+    simulator = source["simulator"]
+    begun = _begun(kept)
     with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
         try:
             for k in range(begun, episodes):
-                keeper.add(_played(keeper.env, player, rules, keeper.source["first_seed"], k))
-                if k == 0 and "hazard" not in (keeper.card or {}):
+                keeper.add(_played(simulators, player, space, seed, k))
+                if k == 0 and "hazard" not in (card or {}):
                     _warn_unless_charged(simulator, keeper.fresh)
                 bar.advance(1)
         except KeyboardInterrupt as stopped:
@@ -109,26 +103,23 @@ def _filled(keeper: _Keeper, player: _Player, rules: _Rules, episodes: int, quie
     return keeper.kept
 
 
+def _free(observations: np.ndarray, state: np.ndarray | None) -> np.ndarray:
+    """(B,) what steps cost whose simulator tells none."""
+    return np.zeros(len(observations))
+
+
+@dataclass(eq=False)
 class _Keeper:
     """What was collected so far: in a store, and since that was last kept."""
 
-    def __init__(
-        self,
-        env: Any,
-        bounds: Bounds,
-        source: dict[str, Any],
-        card: dict | None,
-        file: Path | None,
-        kept: EpisodeStore | None,
-    ):
-        self.env = env
-        self.bounds = bounds
-        self.source = source
-        self.card = card
-        self.file = file
-        self.kept = kept
-        self.skipped = 0 if kept is None else _skipped(kept)
-        self.fresh: list[_Played] = []
+    env: Any
+    bounds: Bounds
+    source: dict[str, Any]
+    card: dict | None
+    file: Path | None
+    kept: EpisodeStore | None
+    skipped: int
+    fresh: list[_Played] = field(default_factory=list)
 
     def add(self, played: _Played | None) -> None:
         """An episode, None of one that was skipped; every hundredth time all is written."""
@@ -165,9 +156,9 @@ def _begun(store: EpisodeStore | None) -> int:
     return 0 if store is None else store.episodes + _skipped(store)
 
 
-def _skipped(store: EpisodeStore) -> int:
+def _skipped(store: EpisodeStore | None) -> int:
     """Episodes that a collection left out."""
-    return int(store.card.extra.get("skipped_episodes", 0))
+    return 0 if store is None else int(store.card.extra.get("skipped_episodes", 0))
 
 
 @dataclass(frozen=True)
@@ -210,17 +201,6 @@ class _Space:
         return clipped.astype(np.float32)  # a space of single precision holds no number of double precision
 
 
-@dataclass(frozen=True)
-class _Rules:
-    """What holds for every episode."""
-
-    space: _Space
-    shape: Shape
-    cost: Cost | None
-    max_steps: int
-    early_ends: str
-
-
 @dataclass(frozen=True, eq=False)
 class _Played:
     """An episode of L steps."""
@@ -247,54 +227,48 @@ class _Played:
         return all(bool((x == x[:, :1]).all()) for x in (self.costs, *self.constraints.values()))
 
 
-def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -> _Played | None:
+def _played(env: SideBySide, player: _Player, space: _Space, first_seed: int, k: int) -> _Played | None:
     """Episode k; None where it is skipped."""
     player.reset()
-    chance = np.random.default_rng((first_seed, k))
-    episode = Episode(env, rules.shape, first_seed + k, rules.max_steps, rules.early_ends)
-    space = rules.space
-    shape = (len(episode.agents), space.entries)
-    seen = [episode.seen]
-    states = [episode.state]
-    actions = []
-    charged = False
-    while episode.running:
+    env.reset([first_seed + k])
+    episode = env.episodes[0]
+    n_agents = len(episode.agents)
+    shape = (n_agents, space.entries)
+    steps: list[Moment] = []
+
+    def act(observations: np.ndarray, state: np.ndarray | None, chance: np.random.Generator) -> np.ndarray:
         if player.act is None:
             action = chance.uniform(space.bounds.low, space.bounds.high, shape)
-        else:
-            state = episode.state
-            action = player.act(episode.seen.copy(), None if state is None else state.copy())  # it may write there
-        actions.append(
-            space.clipped(given_as("actions", action, shape, "the simulator", "return one action for each agent"))
-        )
-        episode.step(actions[-1], rules.cost)
-        if episode.skipped:
-            return None
-        if len(episode.rewards) < len(actions):  # nobody shows where the last action led
-            actions.pop()
-            break
-        charged = charged or not episode.lacks_cost
-        episode.charge(0.0)
-        if not episode.showed_end:
+        else:  # it may write into what it sees
+            action = player.act(observations[0].copy(), None if state is None else state[0].copy())
+        action = given_as("actions", action, shape, "the simulator", "return one action for each agent")
+        return space.clipped(action)[None]
+
+    def keep(now: Moment) -> None:
+        if len(episode.rewards) == len(steps):  # nobody shows where the last action led
+            return
+        if not now.outcome.shown[0]:
             raise UserError(
-                f"step() of {type(env).__name__} tells no observations where an episode ends; logs keep the state that "
-                "the last action leads to, so return them."
+                f"step() of {episode.name} tells no observations where an episode ends; logs keep the state that the "
+                "last action leads to, so return them."
             )
-        seen.append(episode.seen)
-        states.append(episode.state)
-    n_agents = len(episode.agents)
+        steps.append(now)
+
+    rollout(Memoryless(act), env, keep, itertools.repeat(np.random.default_rng((first_seed, k))))
+    if episode.skipped:
+        return None
     names = list(episode.constraints[0]) if episode.constraints else []
-    known_states = [state for state in states if state is not None]
+    observations, states = zip(steps[0].before, *(now.after for now in steps))
     return _Played(
-        observations=np.stack(seen),
-        actions=np.stack(actions),
+        observations=np.concatenate(observations),
+        actions=np.concatenate([now.decided.action for now in steps]),
         rewards=np.stack(episode.rewards),
         costs=_of_every_agent(episode.costs, n_agents),
         constraints={name: _of_every_agent([costs[name] for costs in episode.constraints], n_agents) for name in names},
         by_agent=any(np.ndim(cost) > 0 for cost in episode.costs),
-        state=np.stack(known_states) if known_states else None,
+        state=None if states[0] is None else np.concatenate(states),
         terminated=episode.terminated,
-        charged=charged,
+        charged=episode.charged,
         told=frozenset(episode.told),
     )
 
@@ -314,7 +288,7 @@ def _warn_unless_charged(simulator: str, first: list[_Played]) -> None:
     warnings.warn(
         f"{simulator} tells no cost{f', its infos {told}' if told else ''}: these logs have none and teach no danger; "
         "give each agent's info a 'cost', pass cost=, a function of the infos, or name a formula in card['hazard'].",
-        stacklevel=4,
+        stacklevel=3,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ringfence.problem import normalise
 from ringfence.problem.features import FeatureMap, translation
 from ringfence.problem.normalise import Normaliser
-from ringfence.types import Array, Key, ObservesCost, Policy, PolicyStep, PyTree, Spec
+from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
 
 
@@ -105,14 +105,3 @@ def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, presen
         action = act(jnp.take_along_axis(x, jnp.broadcast_to(index, (*x.shape[:-1], index.shape[1])), -1))
         actions.append(action)
     return jnp.stack(actions, 1)[:, None]
-
-
-def with_cost(policy: Policy, carry: PyTree, cost: Any) -> PyTree:
-    """The carry of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint; arrays
-    of NumPy or JAX."""
-    return policy.observe_cost(carry, cost) if isinstance(policy, ObservesCost) else carry
-
-
-def act_with(policy: Policy, carry: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
-    """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
-    return policy.act(carry, observations, state, key)

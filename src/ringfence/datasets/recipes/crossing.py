@@ -101,11 +101,7 @@ def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore
 
     episodes = gather(chunk, transitions // env.episode_length, BATCH)
     return EpisodeStore.from_episodes(
-        episodes["observations"],
-        episodes["actions"],
-        episodes["rewards"],
-        episodes["costs"],
-        state=episodes["state"],
+        **episodes,
         card=card
         | {
             "transitions": transitions,

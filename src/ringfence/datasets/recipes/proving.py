@@ -7,9 +7,8 @@ from functools import partial
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
-from ringfence.datasets.behaviour import gather
+from ringfence.datasets.behaviour import gather, logged
 from ringfence.datasets.recipes import COLLECTION
 from ringfence.datasets.task import Card, Recipe, Task
 from ringfence.datasets.version import RECIPES
@@ -83,11 +82,7 @@ def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore
         "observation_names": list(system.observation_names),
     }
     return EpisodeStore.from_episodes(
-        episodes["observations"],
-        episodes["actions"],
-        episodes["rewards"],
-        episodes["costs"],
-        state=episodes["state"],
+        **episodes,
         card=card | more,
     )
 
@@ -95,15 +90,7 @@ def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore
 @partial(jax.jit, static_argnums=(0, 2))
 def _played(system: System, key: Key, batch: int) -> dict[str, Array]:
     """Arrays (B, L, ...) of a batch of episodes."""
-    states, actions, rewards, costs = system.played(key, batch)
-    kept = {
-        "observations": jax.vmap(system.observe)(states),
-        "state": jax.vmap(system.global_state)(states),
-        "actions": actions,
-        "rewards": rewards,
-        "costs": costs,
-    }
-    return {name: jnp.swapaxes(value, 0, 1) for name, value in kept.items()}
+    return logged(system, *system.played(key, batch))
 
 
 def _system(task: Task) -> System:

@@ -61,11 +61,7 @@ def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore
     else:
         episodes, how = played(env, task.tier, count, seed)
     return EpisodeStore.from_episodes(
-        episodes["observations"],
-        episodes["actions"],
-        episodes["rewards"],
-        episodes["costs"],
-        state=episodes["state"],
+        **episodes,
         card=card | {"transitions": transitions, "collected": how} | drivers,
     )
 

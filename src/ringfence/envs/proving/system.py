@@ -21,6 +21,7 @@ from ringfence.envs.proving import drivers, film, goals, observations
 from ringfence.envs.proving.bodies import length
 from ringfence.envs.proving.dangers import LOW_CHARGE, MARGIN, METRES, OF_PLACE, SOLID
 from ringfence.envs.proving.layout import Layout, SystemState
+from ringfence.envs.rollout import scanned
 from ringfence.problem import features
 from ringfence.types import Array, Key, Transition
 from ringfence.utils.precision import in_float32
@@ -119,25 +120,17 @@ class System(Layout, Defaults):
             )
         return now, Transition(before - after - EFFORT * effort, cost, over)
 
-    def played(
-        self, key: Key, batch: int, habit: drivers.Habit | None = None
-    ) -> tuple[SystemState, Array, Array, Array]:
-        """(states (L+1, B, ...), actions, rewards, costs (L, B, ...)) of the system's drivers, or of those with a
-        habit."""
+    def played(self, key: Key, batch: int, habit: drivers.Habit | None = None) -> tuple[SystemState, Array, Transition]:
+        """Episodes (rollout.scanned) of the system's drivers, or of those with a habit."""
         key_reset, key_habit, key_look, key_hand = jax.random.split(key, 4)
         shape = (batch, self.n_agents)
         driver = drivers.habits(self.drivers, key_habit, shape) if habit is None else habit
-        first = self.reset(key_reset, batch)
 
-        def step(state: SystemState, t: Array) -> tuple[SystemState, tuple[SystemState, Array, Array, Array]]:
+        def choose(state: SystemState, t: Array) -> Array:
             seeing = drivers.looks(driver, key_look, t, shape)
-            action = drivers.drive(self, state, driver, jax.random.fold_in(key_hand, t), seeing)
-            after, out = self.step(state, action)
-            return after, (after, action, out.reward, out.cost)
+            return drivers.drive(self, state, driver, jax.random.fold_in(key_hand, t), seeing)
 
-        _, (after, actions, rewards, costs) = jax.lax.scan(step, first, jnp.arange(self.episode_length))
-        states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, after)
-        return states, actions, rewards, costs
+        return scanned(self, self.reset(key_reset, batch), choose, jnp.arange(self.episode_length))
 
     def distances(self, state: SystemState) -> dict[str, Array]:
         """(..., N) the true signed distance of every danger: m, rad, m/s, share of a charge."""
@@ -216,8 +209,8 @@ def _sample(system: System) -> np.ndarray:
     """(E, L + 1, N, O) what drivers of it see; of homogeneous agents each is an episode of its own."""
 
     def rows(key: Key) -> Array:
-        states, _, _, _ = system.played(key, SAMPLE)
-        return jnp.swapaxes(jax.vmap(system.observe)(states), 0, 1)
+        states, _, _ = system.played(key, SAMPLE)
+        return jax.vmap(system.observe, 1, 1)(states)
 
     @in_float32
     def played() -> np.ndarray:

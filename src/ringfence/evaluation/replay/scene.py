@@ -131,6 +131,11 @@ class Windows:
         return len(self.driven)
 
     @property
+    def rows(self) -> np.ndarray:
+        """(W,) which indexes windows beside `driven`."""
+        return np.arange(self.count)
+
+    @property
     def steps(self) -> int:
         return self.actions.shape[1]
 
@@ -143,7 +148,7 @@ class Windows:
     def others_move(self) -> np.ndarray:
         """(W, L+1, K, X) m/s: as observed, or by differences."""
         if drift := self.names.pairs("other{}.dv{{}}", self.names.slots):
-            mine = self.observations[np.arange(self.count), :, self.driven]
+            mine = self.observations[self.rows, :, self.driven]
             return mine[..., np.array(drift)] + self.velocity[:, :, None]
         moved = np.diff(self.others_at, axis=1) / self.dt
         return np.concatenate([moved, moved[:, -1:]], 1)
@@ -170,11 +175,10 @@ class Windows:
         moved = place - self.place[:, t]
         faster = velocity - self.velocity[:, t]
         x = np.array(self.observations[:, t], np.float64)
-        rows = np.arange(self.count)
-        mine = x[rows, self.driven]
+        mine = x[self.rows, self.driven]
         self._own(mine, moved, faster, velocity, heading)
         self._others(mine, moved, faster)
-        x[rows, self.driven] = mine
+        x[self.rows, self.driven] = mine
         self._as_others_see(t, x, moved, faster)
         return x.astype(np.float32), self._whole(t, moved, faster)
 
@@ -231,14 +235,14 @@ class Windows:
     def _listed(self, t: int) -> np.ndarray:
         """(W, N) which of its others the driven agent is to each agent at row t: by the team's order, or the one that
         is where the driven agent is, where places tell that it is none of the team's order."""
-        n, rows = self.names.agents, np.arange(self.count)
+        n = self.names.agents
         usual = np.minimum(self.driven[:, None] - (self.driven[:, None] > np.arange(n)), n - 2)
         x = np.asarray(self.observations[:, t], np.float64)
         place = self.names.place(x, None if self.state is None else np.asarray(self.state[:, t], np.float64))
         if place is None:
             return usual
         gap = x[..., np.array(self.names.pairs("other{}.d{{}}", n - 1))]  # (W, N, K, X)
-        gap = np.linalg.norm(gap - (place[rows, self.driven][:, None] - place)[:, :, None], axis=-1)
+        gap = np.linalg.norm(gap - (place[self.rows, self.driven][:, None] - place)[:, :, None], axis=-1)
         near = EXACT * np.maximum(np.linalg.norm(place - place[:, :1], axis=-1).max(-1), EXACT)[:, None]
         wrong = np.take_along_axis(gap, usual[..., None], -1)[..., 0] > near
         return np.where(wrong & (gap.min(-1) <= near), gap.argmin(-1), usual)

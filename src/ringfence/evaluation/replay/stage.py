@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,25 +10,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.envs.base import Outcome, Seed, Seen
+from ringfence.envs.rollout import Memoryless, Moment, rollout, split_off
 from ringfence.errors import UserError
 from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit
 from ringfence.evaluation.replay.scene import Windows
-from ringfence.evaluation.rollout import FORESEEN
+from ringfence.evaluation.rollout import FORESEEN, Acting
 from ringfence.faults import Faults
-from ringfence.faults.policy import Faulty, behind
+from ringfence.faults.policy import behind
 from ringfence.guards import Guard
 from ringfence.guards.policy import Guarded
-from ringfence.proposals.base import act_with, held, with_cost
+from ringfence.proposals.base import held
 from ringfence.types import Array, Policy, PolicyStep, PyTree
 from ringfence.utils.device import on_device
 from ringfence.utils.progress import Progress
 from ringfence.world import World
 
-Seen = tuple[np.ndarray, np.ndarray | None]  # observations (W, N, O) and state (W, S)
 TOLD = ("infeasible", "ood", "clearance", FORESEEN)  # of a guard's info
 NO_FAULTS = Faults()
-_act = jax.jit(act_with)
 
 
 @jax.jit
@@ -46,32 +47,108 @@ def _present(world: World, observations: Any, state: Any) -> Array:
     return on_device(world.map(observations, state))
 
 
-class _Bad:
-    """A bad driver as a policy, under guard or not: what it and the others do is set before every step."""
+class Replayed:
+    """Windows of logs as an `Env` (envs/base.py): one agent of each is driven, the others move as logged. With a
+    `brake` the driven one stops before everybody's constant velocity leads to contact."""
 
-    def __init__(self, guard: Guarded | None):
-        self.guard = guard
-        self.team = np.zeros(0)  # (W, N, A)
+    def __init__(self, windows: Windows, kinematics: Kinematics, radius: float, brake: bool):
+        self.windows = windows
+        self.kinematics = kinematics
+        self.radius = radius
+        self.brake = brake
+        world = kinematics.world if kinematics.name == "world" else None
+        self.foresee = None if world is None else foreseen_velocity(world)
+        self.reset()
+
+    @property
+    def running(self) -> np.ndarray:
+        return np.full(self.windows.count, self.step_number < self.windows.steps)
+
+    def reset(self, seeds: Sequence[Seed] = ()) -> None:
+        """To where the windows begin; nothing is drawn."""
+        w = self.windows
+        self.step_number = 0
+        self.place = w.place[:, 0].copy()
+        self.velocity = w.velocity[:, 0].copy()
+        self.heading = np.arctan2(self.velocity[:, 1], self.velocity[:, 0])
+        if looks := w.names.entries.direction:
+            first = w.observations[w.rows, 0, w.driven][:, looks]
+            self.heading = first[:, 0] if len(looks) == 1 else np.arctan2(first[:, 1], first[:, 0])
+        self.seen = Seen(*w.observed(0, *self.motion))
+
+    @property
+    def motion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Place (W, X), velocity (W, X) and heading (W,) of the driven agents."""
+        return self.place, self.velocity, self.heading
+
+    @property
+    def now(self) -> Now:
+        """What a driver knows."""
+        w = self.windows
+        t = self.step_number
+        away = w.others_at[:, t] - self.place[:, None]
+        goal = w.goal - self.place
+        begun = w.velocity[:, 0]
+        return Now(self.velocity, self.heading, begun, goal, away, w.others_move[:, t], self.kinematics.max_speed)
+
+    def observe(self) -> Seen:
+        return self.seen
+
+    def step(self, action: np.ndarray) -> Outcome:
+        """By the driven agents' actions; a contact costs 1."""
+        w = self.windows
+        own = np.asarray(action, np.float64)[w.rows, w.driven]
+        if not np.isfinite(own).all():
+            raise UserError("The policy gave actions that are not finite; it has diverged: train or fit it again.")
+        info: dict[str, np.ndarray] = {}
+        if self.brake:
+            own, info["braked"] = braked(self.now, own, self.kinematics, self.radius)
+        self.place, self.velocity, self.heading = self.kinematics.moved(*self.motion, own, self._foreseen(own))
+        self.step_number += 1
+        self.seen = Seen(*w.observed(self.step_number, *self.motion))
+        touches = w.distances(self.step_number, self.place).min(-1) < self.radius
+        nothing = np.zeros(w.count)
+        return Outcome(nothing, touches.astype(np.float32), nothing.astype(bool), np.ones(w.count, bool), info)
+
+    def team(self, own: np.ndarray) -> np.ndarray:
+        """(W, N, A) everybody's actions: others do as they did, the driven agents act by (W, A)."""
+        w = self.windows
+        team = w.actions[:, self.step_number].copy()
+        team[w.rows, w.driven] = own
+        return team
+
+    def _foreseen(self, own: np.ndarray) -> np.ndarray | None:
+        """(W, X) the velocity after these actions, where a World says it."""
+        world = self.kinematics.world
+        if world is None or self.foresee is None:
+            return None
+        change = self.foresee(_present(world, *self.seen), in_unit(self.team(own), world))
+        return self.velocity + change[self.windows.rows, self.windows.driven]
+
+
+@dataclass(frozen=True, eq=False)
+class _Filtered:
+    """Somebody's actions (W, N, A) under guard, who reads none of what is observed."""
+
+    actions: Callable[[], np.ndarray]
+    guard: Guarded
 
     def initial_state(self, batch: int) -> PyTree:
-        return {} if self.guard is None else self.guard.initial_state(batch)
+        return self.guard.initial_state(batch)
 
     def observe_cost(self, carry: PyTree, cost: Any) -> PyTree:
-        return carry if self.guard is None else self.guard.observe_cost(carry, cost)
+        return self.guard.observe_cost(carry, cost)
 
     def observe_age(self, carry: PyTree, age: Array) -> PyTree:
-        return carry if self.guard is None else self.guard.observe_age(carry, age)
+        return self.guard.observe_age(carry, age)
 
     def observe_sent(self, carry: PyTree, action: Array) -> PyTree:
-        return carry if self.guard is None else self.guard.observe_sent(carry, action)
+        return self.guard.observe_sent(carry, action)
 
     def act(self, carry: PyTree, observations: Any, state: Any, key: Array) -> tuple[PyTree, PolicyStep]:
-        team: Any = self.team
-        if self.guard is None:
-            return carry, PolicyStep(team, {})
-        world = self.guard.guard.world
-        present = _present(world, observations, state)
-        return _decided(self.guard, carry, present, held(in_unit(team, world), self.guard.guard.options.horizon), key)
+        guard = self.guard.guard
+        wanted = held(in_unit(self.actions(), guard.world), guard.options.horizon)
+        return _decided(self.guard, carry, _present(guard.world, observations, state), wanted, key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,49 +178,24 @@ class Stage:
         """`driver`: a name of DRIVERS, or a policy; `guard` filters what it does, and so does the `brake`. The `bar`
         counts steps."""
         w = self.windows
-        place = w.place[:, 0].copy()
-        velocity = w.velocity[:, 0].copy()
-        heading = np.arctan2(velocity[:, 1], velocity[:, 0])
-        if looks := w.names.entries.direction:
-            first = w.observations[np.arange(w.count), 0, w.driven][:, looks]
-            heading = first[:, 0] if len(looks) == 1 else np.arctan2(first[:, 1], first[:, 0])
-        if guard is not None:
-            guard = self._of_one(guard)
-        if guard is not None and not isinstance(driver, str):
-            driver = replace(guard, proposal=driver)
-        bad = _Bad(guard) if isinstance(driver, str) else None
-        actor: Any = self._behind(bad or driver)
-        memory = actor.initial_state(w.count)
-        world = self.kinematics.world if self.kinematics.name == "world" else None
-        foresee = None if world is None else foreseen_velocity(world)
-        key = jax.random.key(self.seed)
-        rows = [(place, velocity, heading)]
-        contact = np.zeros(w.count, bool)
-        info: dict[str, list[np.ndarray]] = {}
-        for t in range(w.steps):
-            seen = w.observed(t, place, velocity, heading)
-            now = self._now(t, place, velocity, heading)
-            key, step_key = jax.random.split(key)
-            if bad is not None:
-                wanted = DRIVERS[str(driver)](now)
-                bad.team = self._team(t, self.kinematics.toward(wanted, velocity, heading))
-            memory, action, step_info = self._action(actor, memory, seen, step_key)
-            if brake:
-                action, step_info["braked"] = braked(now, action, self.kinematics, self.radius)
-            for name, value in step_info.items():
-                info.setdefault(name, []).append(np.asarray(value))
-            after = None
-            if world is not None and foresee is not None:
-                after = velocity + foresee(*self._in_world(world, t, seen, action))[np.arange(w.count), w.driven]
-            place, velocity, heading = self.kinematics.moved(place, velocity, heading, action, after)
-            touches = w.distances(t + 1, place).min(-1) < self.radius
-            contact |= touches
-            rows.append((place, velocity, heading))
-            memory = with_cost(actor, memory, jnp.asarray(touches, jnp.float32))
+        env = Replayed(w, self.kinematics, self.radius, brake)
+        actor = Acting(self._behind(self._guarded(driver, env, guard)))
+        rows = [env.motion]
+        touches: list[np.ndarray] = []
+        info: list[dict[str, np.ndarray]] = []
+
+        def keep(now: Moment) -> None:
+            rows.append(env.motion)
+            touches.append(now.outcome.cost > 0)
+            told = {name: self._told(now.decided.info, name) for name in TOLD if name in now.decided.info}
+            info.append({**told, **now.outcome.info})
             if bar is not None:
                 bar.advance(1)
+
+        rollout(actor, env, keep, split_off(jax.random.key(self.seed)))
         place, velocity, heading = (np.stack(each, 1) for each in zip(*rows))
-        return Driven(place, velocity, heading, contact, {k: np.stack(v, 1) for k, v in info.items()})
+        told = {name: np.stack([one[name] for one in info], 1) for name in info[0]}
+        return Driven(place, velocity, heading, np.any(touches, 0), told)
 
     def scores(self, guard: Guard, driven: Driven) -> np.ndarray:
         """(W, L) of the steps that the driven agents took, as a guard's barrier has it."""
@@ -151,7 +203,19 @@ class Stage:
         moments = zip(*(np.moveaxis(x, 1, 0) for x in (driven.place, driven.velocity, driven.heading)))
         x = jnp.stack([_present(guard.world, *w.observed(t, *moment)) for t, moment in enumerate(moments)], 1)
         scores = _scored(guard, x[:, :-1], x[:, 1:])
-        return np.asarray(scores)[np.arange(w.count), :, w.driven]
+        return np.asarray(scores)[w.rows, :, w.driven]
+
+    def _guarded(self, driver: str | Policy, env: Replayed, guard: Guarded | None) -> Policy:
+        """Who decides: a bad driver or a policy, under guard if there is one."""
+        guard = None if guard is None else self._of_one(guard)
+        if not isinstance(driver, str):
+            return driver if guard is None else replace(guard, proposal=driver)
+
+        def wanted(*observed: Any) -> np.ndarray:
+            velocity = DRIVERS[driver](env.now)
+            return env.team(self.kinematics.toward(velocity, env.velocity, env.heading))
+
+        return Memoryless(wanted) if guard is None else _Filtered(wanted, guard)
 
     def _of_one(self, guard: Guarded) -> Guarded:
         """A team's guard, which is told whose actions it decides; agents who are alone decide their own anyway."""
@@ -159,13 +223,6 @@ class Stage:
             return guard
         w = self.windows
         return replace(guard, driven=jnp.asarray(np.arange(w.actions.shape[2]) == w.driven[:, None]))
-
-    def _now(self, t: int, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray) -> Now:
-        w = self.windows
-        away = w.others_at[:, t] - place[:, None]
-        return Now(
-            velocity, heading, w.velocity[:, 0], w.goal - place, away, w.others_move[:, t], self.kinematics.max_speed
-        )
 
     def _behind(self, policy: Any) -> Any:
         """The driven agent's policy behind faults; a brake is never behind them."""
@@ -180,29 +237,8 @@ class Stage:
         bounds = (self.kinematics.low, self.kinematics.high)
         return behind(policy, self.faults, observations.shape[1], actions, names, states, bounds, w.steps)
 
-    def _action(self, actor: Any, memory: Any, seen: Seen, key: Any) -> tuple[Any, np.ndarray, dict[str, Any]]:
-        """(memory, actions (W, A) of the driven agents, what the guard says)."""
-        w = self.windows
-        foreign = isinstance(actor, _Bad) or (isinstance(actor, Faulty) and isinstance(actor.policy, _Bad))
-        memory, step = (act_with if foreign else _act)(actor, memory, *seen, key)
-        acted = np.asarray(step.action, np.float64)[np.arange(w.count), w.driven]
-        if not np.isfinite(acted).all():
-            raise UserError("The policy gave actions that are not finite; it has diverged: train or fit it again.")
-        return memory, acted, {name: self._told(step.info, name) for name in TOLD if name in step.info}
-
     def _told(self, info: dict[str, Any], name: str) -> np.ndarray:
         """(W,) what a guard says of the driven agents, where it says it of each."""
         w = self.windows
         own = info.get(f"agent_{name}")
-        return np.asarray(info[name]) if own is None else np.asarray(own)[np.arange(w.count), w.driven]
-
-    def _in_world(self, world: World, t: int, seen: Seen, action: np.ndarray) -> tuple[Array, Array]:
-        """What a World sees (W, N, D), and everybody's actions (W, N, A) in its units."""
-        return _present(world, *seen), in_unit(self._team(t, action), world)
-
-    def _team(self, t: int, action: np.ndarray) -> np.ndarray:
-        """(W, N, A) everybody's actions in row t: others do as they did, the driven agents act by (W, A)."""
-        w = self.windows
-        team = w.actions[:, t].copy()
-        team[np.arange(w.count), w.driven] = action
-        return team
+        return np.asarray(info[name]) if own is None else np.asarray(own)[w.rows, w.driven]
