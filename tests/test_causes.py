@@ -590,7 +590,7 @@ def test_verdicts_give_their_reasons():
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, **changes)))
         assert found.word == word and found.reasons == (reason,) and found.remedies
     of_cause = Cause("own.x", ((0,),))
-    for told, recall, word in ((0.59, 0.96, "unfit"), (0.9, 0.96, "weak"), (0.59, 1.0, "fit"), (0.96, 0.96, "fit")):
+    for told, recall, word in ((0.59, 0.96, "weak"), (0.59, 1.0, "fit"), (0.93, 0.96, "fit")):
         causes = {"": Found((of_cause,), told)}
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, recall=recall), causes=causes))
         assert found.word == word and (word == "fit" or f"tell only {told:.1%} of the danger" in found.reasons[0])

@@ -15,7 +15,7 @@ from ringfence.world.causes import Found
 Word = Literal["fit", "weak", "unfit"]
 ENTRIES = (5, 30)  # held-out entries into danger: with fewer than these nothing, or little, is known
 RECALL = (0.8, 0.95)  # share of unsafe steps found with 1 false alarm in 100
-TOLD = (0.8, 0.95)  # share of unsafe steps that causes tell, where the barrier does not find nearly all by them
+TOLD = (0.0, 0.8)  # share of unsafe steps that causes tell, where the barrier does not find nearly all by them
 NEARLY_ALL = 0.99  # of the unsafe steps
 KEPT = (0.2, 0.6)  # share of safe steps that keep the margin: a guard fights most actions below it
 FORESEEN = (0.5, 0.95)  # share of entries into danger that are predicted to have less than the margin
