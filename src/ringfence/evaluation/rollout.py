@@ -78,9 +78,8 @@ def rollout(
             f"Simple Spread runs inside JAX, and {type(policy).__name__} is no pytree; make it an equinox.Module whose "
             "act() uses jax.numpy."
         )
-    played = _in_chunks(
-        _compiled(env, jax.random.key(root), act_key, foreseen), policy, episodes, num_recorded, label, quiet
-    )
+    keys = jax.random.key(root), act_key
+    played = _in_chunks(_compiled(env, foreseen), policy, keys, episodes, num_recorded, label, quiet)
     _refuse_lost(played)
     return {
         "rewards": played.pop("reward"),
@@ -92,12 +91,13 @@ def rollout(
     }
 
 
-def _compiled(
-    env: PureEnv, reset_key: Key, act_key: Key, foreseen: bool
-) -> Callable[[Policy, int, int, int], dict[str, Array]]:
-    """A program that plays the chunk `index` of `batch` episodes and keeps what was drawn in the first `keep`."""
+def _compiled(env: PureEnv, foreseen: bool) -> Callable[[Policy, tuple[Key, Key], int, int, int], dict[str, Array]]:
+    """A program that plays the chunk `index` of `batch` episodes and keeps what was drawn in the first `keep`; keys are
+    of resets and of actions. It is the same one for all seeds, and found again where compiled programs are kept."""
 
-    def play(policy: Policy, index: int, batch: int, keep: int) -> dict[str, Array]:
+    def play(policy: Policy, keys: tuple[Key, Key], index: int, batch: int, keep: int) -> dict[str, Array]:
+        reset_key, act_key = keys
+
         def step(before: PyTree, key: Key) -> tuple[PyTree, dict[str, Array]]:
             carry, state = before
             carry, decided = policy.act(carry, env.observe(state), env.global_state(state), key)
@@ -114,31 +114,35 @@ def _compiled(
             return (carry, after), kept
 
         state = env.reset(jax.random.fold_in(reset_key, index), batch)
-        keys = jax.random.split(jax.random.fold_in(act_key, index), env.episode_length)
-        _, kept = jax.lax.scan(step, (policy.initial_state(batch), state), keys)
+        of_steps = jax.random.split(jax.random.fold_in(act_key, index), env.episode_length)
+        _, kept = jax.lax.scan(step, (policy.initial_state(batch), state), of_steps)
         kept = {name: jnp.moveaxis(value, 0, 1) for name, value in kept.items()}
         kept["state"] = jnp.concatenate([env.global_state(state)[:, None], kept["state"]], 1)
         return kept
 
-    return jax.jit(play, static_argnums=(2, 3))
+    return jax.jit(play, static_argnums=(3, 4))
 
 
 def _in_chunks(
-    play: Callable[[Policy, int, int, int], dict[str, Array]],
+    play: Callable[[Policy, tuple[Key, Key], int, int, int], dict[str, Array]],
     policy: Policy,
+    keys: tuple[Key, Key],
     episodes: int,
     num_recorded: int,
     label: str,
     quiet: bool,
 ) -> Played:
-    """Always whole chunks, so that the first n episodes are the same ones whatever number is asked for."""
+    """Always whole chunks, so that the first n episodes are the same ones whatever number is asked for, and by one
+    program, which keeps as much of each as of the first."""
     chunks: list[Played] = []
+    most = min(num_recorded, CHUNK)
     with Progress(label, episodes, 0, quiet) as bar:
         for first in range(0, episodes, CHUNK):
-            keep = min(max(num_recorded - first, 0), CHUNK)
-            chunks.append(jax.device_get(play(policy, first // CHUNK, CHUNK, keep)))
+            chunk = jax.device_get(play(policy, keys, first // CHUNK, CHUNK, most))
+            left = max(num_recorded - first, 0)
+            chunks.append({name: value if name in CUT else value[:left] for name, value in chunk.items()})
             bar.advance(min(CHUNK, episodes - first))
-    played = {name: np.concatenate([c[name] for c in chunks if name in c]) for name in chunks[0]}
+    played = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
     return {name: value[:episodes] if name in CUT else value for name, value in played.items()}
 
 
