@@ -721,6 +721,34 @@ def wide_plans_pay() -> tuple[bool, str]:
 
 
 @on("results/planner")
+def same_from_plans() -> tuple[bool, str]:
+    """What `full` earns from plans less what it earns from clones, by the same seeds on the same resets."""
+    words, holds = [], True
+    for task in planner_tables.SPREAD:
+        task = f"simple_spread-{task}"
+        rows = planner_tables.rows_of("guards", task)
+        both = [planner_tables.played(rows, name, "under full") for name in ("icbf", "bc")]
+        seeds = {r["seed"] for r in both[0]} & {r["seed"] for r in both[1]}
+        plans, clones = (planner_tables.episodes([r for r in some if r["seed"] in seeds], "return") for some in both)
+        low, high = mean_of_runs(TASKS[task].normalised_return(plans) - TASKS[task].normalised_return(clones))
+        holds = holds and low < 0 < high and len(seeds) >= 3
+        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(seeds)} seeds")
+    return bool(holds), "; ".join(words)
+
+
+@on("results/planner")
+def plans_cross() -> tuple[bool, str]:
+    """On Crossing under a shield: what plans earn more than clones, and steps in contact of either."""
+    rows = planner_tables.rows_of("crossing", "crossing-hasty")
+    both = [planner_tables.played(rows, name, "under shield") for name in ("icbf", "bc")]
+    plans, clones = (planner_tables.episodes(some, "return") for some in both)
+    low, high = mean_of_runs(plans - clones)
+    cost = max(r["cost"] for some in both for r in some)
+    words = f"{plans.mean():.2f} for {clones.mean():.2f} [{low:+.2f}, {high:+.2f}], {len(plans)} seeds, cost {cost}"
+    return bool(low > 0 and cost == 0 and len(plans) >= 5), words
+
+
+@on("results/planner")
 def mean_plan_pays() -> tuple[bool, str]:
     """What the mean plan earns more, on the pool and on one learner."""
     words, apart = [], []
@@ -808,6 +836,8 @@ CLAIMS: dict[str, dict[str, Check]] = {
     },
     "docs/ope.md": {"Danger is ranked well": danger_is_ranked},
     "docs/planner-results.md": {
+        "Where values are climbed, it is the same from plans and from clones": same_from_plans,
+        "On Crossing plans earn more than clones under the same shield": plans_cross,
         "which is what the paper prints": planner_reaches(FIVE, 1.1, 0.005),
         "Guidance takes the cost and adds return": guidance_takes_cost,
         "The mean plan is what makes it learn a pool": mean_plan_pays,

@@ -124,6 +124,15 @@ def changes(group: str, way: str, tasks: Sequence[str], paired: str | None = Non
     return markdown([heads[i] for i in keep], [[line[i] for i in keep] for line in lines])
 
 
+def full() -> str:
+    """What the guard `full` earns from plans and from clones, of the same seeds and on the same resets."""
+    lines = []
+    for task in (f"simple_spread-{tier}" for tier in SPREAD):
+        plans, clones = (played(rows_of("guards", task), name, "under full") for name in ("icbf", "bc"))
+        lines.append((task.removeprefix("simple_spread-"), brief(plans), brief(clones), less(plans, clones, task)))
+    return markdown(("logs", "`full` from plans", "`full` from clones", "difference"), lines)
+
+
 LEARNED = ("simple_spread-expert", "simple_spread-expert-pooled")
 
 
@@ -230,6 +239,8 @@ def others() -> str:
         for group in ("robots", "crossing"):
             rows = rows_of(group, task)
             for name, way in dict.fromkeys((r["name"], way) for r in rows for way in r["plays"]):
+                if (name, way) == ("bc", "alone"):  # nothing guides a clone
+                    continue
                 found = played(rows, name, way)
                 plays = f"{np.mean([r['return_mean'] for r in found]):.4g}"
                 lines.append(
@@ -243,6 +254,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     (PAGE, "planner-ablations"): lambda: changes("ablations", "alone", LEARNED, "as it is"),
     (PAGE, "planner-frontier"): frontier,
     (PAGE, "planner-algorithm1"): lambda: changes("algorithm1", "as it is", LEARNED),
+    (PAGE, "planner-full"): full,
     (PAGE, "planner-others"): others,
     ("README.md", "glance"): glance,
     ("docs/benchmark.md", "glance"): glance,
