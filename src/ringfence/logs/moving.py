@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -47,16 +46,17 @@ def moved(
     given = {"observations": observations, "state": state}
     precise = {name: array for name, array in given.items() if array is not None and array.dtype.itemsize > 4}
     if precise and not card.origins:
-        for name, origins in _origins_of(precise, episode_ends).items():
+        rows = looked_at(episode_ends)
+        for name, origins in origins_of({name: (x[rows], x[rows + 1]) for name, x in precise.items()}).items():
             given[name] = precise[name] - origins
-            card = card.updated(**_said(card, name, origins))
+            card = moved_by(card, name, origins)
     near = {name: None if x is None else x.astype(np.float32, copy=False) for name, x in given.items()}
     assert near["observations"] is not None
     return near["observations"], near["state"], card
 
 
-def _said(card: StoreCard, name: str, origins: np.ndarray) -> dict[str, Any]:
-    """What the card says of origins (D,) of an array."""
+def moved_by(card: StoreCard, name: str, origins: np.ndarray) -> StoreCard:
+    """The card that says what origins (D,) of an array are."""
     names = card.observation_names if name == "observations" else card.state_names
     named = names if names and len(names) == len(origins) else [f"entry {d}" for d in range(len(origins))]
     some = [f"{origins[d]:.10g} from {named[d]}" for d in np.flatnonzero(origins)]
@@ -65,18 +65,23 @@ def _said(card: StoreCard, name: str, origins: np.ndarray) -> dict[str, Any]:
         "it is from what is given at run time"
     )
     field = "observation_origins" if name == "observations" else "state_origins"
-    return {field: origins.tolist(), "warnings": [*card.warnings, warning]}
+    return card.updated(**{field: origins.tolist(), "warnings": [*card.warnings, warning]})
 
 
-def _origins_of(arrays: Mapping[str, np.ndarray], episode_ends: np.ndarray) -> dict[str, np.ndarray]:
-    """(D,) what to take from the entries of arrays (T+E, ..., D), of those of which something is to be taken.
+def looked_at(episode_ends: np.ndarray) -> np.ndarray:
+    """(K,) rows of T+E whose steps are looked at; each is followed by the row that its step leads to."""
+    steps = np.unique(np.linspace(0, episode_ends[-1] - 1, STEPS).astype(int))
+    return steps + np.searchsorted(episode_ends, steps, side="right")
+
+
+def origins_of(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
+    """(D,) what to take from the entries of arrays, of those of which something is to be taken; of each the rows that
+    are looked at, before and after a step, (K, ..., D).
 
     Entries whose numbers are near to each other have the same origin, whatever array they are of: their differences
     stay what they are.
     """
-    steps = np.unique(np.linspace(0, episode_ends[-1] - 1, STEPS).astype(int))
-    rows = steps + np.searchsorted(episode_ends, steps, side="right")
-    entries = {name: list(_entries(array[rows], array[rows + 1])) for name, array in arrays.items()}
+    entries = {name: list(_entries(*pair)) for name, pair in pairs.items()}
     found = {name: np.zeros(len(each)) for name, each in entries.items()}
     for members in _clusters([one for each in entries.values() for one in each]):
         origin = _round(min(one.least for one in members), max(one.most for one in members))

@@ -33,7 +33,7 @@ from ringfence.errors import StoreError, UserError, of_kind, reading, unknown
 from ringfence.logs.io.columns import Tables
 from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.logs.moving import moved
+from ringfence.logs.moving import moved, moved_by
 from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, given_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
@@ -366,15 +366,31 @@ class EpisodeStore:
         _check_rows("terminated", terminated, len(ends))
         _check_last("final_observations", final_observations, (len(ends), *observations.shape[1:]))
         states = _whole_states(state, final_state, ends, n_steps)
-        if rewards.ndim == 1:
-            rewards = np.repeat(rewards[:, None], n_agents, 1)
         ended = np.zeros(len(ends), bool) if terminated is None else _truths("terminated", terminated)
         seen = np.insert(observations, ends, final_observations, axis=0)
         seen, states, card = moved(seen, states, ends, given_card(card))
+        return cls._of_rows(seen, actions, rewards, costs, several, ends, ended, card, states, speed)
+
+    @classmethod
+    def _of_rows(
+        cls,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        costs: Any,
+        several: np.ndarray | None,
+        ends: np.ndarray,
+        ended: np.ndarray,
+        card: StoreCard,
+        states: np.ndarray | None = None,
+        speed: Any = None,
+    ) -> EpisodeStore:
+        """Of observations (T+E, N, O) in single precision, and what `from_steps` takes otherwise; `ended` (E,)."""
+        n_steps, n_agents = actions.shape[:2]
         return cls(
-            seen,
+            observations,
             actions,
-            rewards,
+            np.repeat(rewards[:, None], n_agents, 1) if rewards.ndim == 1 else rewards,
             np.zeros(n_steps, np.float32) if costs is None else _numbers("costs", costs).astype(np.float32),
             _flags(ends[ended], n_steps),
             _flags(ends[~ended], n_steps),
@@ -384,6 +400,17 @@ class EpisodeStore:
             None if speed is None else _numbers("speed", speed),
             several,
         )
+
+    @classmethod
+    def _of_table(cls, found: Mapping[str, Any]) -> EpisodeStore:
+        """Of what `read_table` gives."""
+        actions, rewards = (_floats(name, found[name]) for name in ("actions", "rewards"))
+        costs, several, card = _several(found["costs"], actions.shape[:1], actions.shape[1], found["card"])
+        card = given_card(card)
+        if found["origins"] is not None:
+            card = moved_by(card, "observations", found["origins"])
+        ends = found["episode_ends"]
+        return cls._of_rows(found["observations"], actions, rewards, costs, several, ends, found["terminated"], card)
 
     @classmethod
     def from_table(
@@ -405,7 +432,7 @@ class EpisodeStore:
             schema = TableSchema.of(options)
         elif options:
             raise UserError(f"schema and {next(iter(options))} both say how the table is read; give one of them.")
-        return cls.from_steps(**read_table(table, schema, notes=notes, card=card))
+        return cls._of_table(read_table(table, schema, notes=notes, card=card))
 
     @classmethod
     def from_layout(
@@ -437,7 +464,7 @@ class EpisodeStore:
         the same entries, bounds and steps, and no episode is in both. Options as of `from_table` or `from_layout`."""
         table, schema = (table, TableSchema.of(options)) if layout is None else read_layout(table, layout, options)
         steps, early = read_parts(table, schema, share, notes=notes, card=card)
-        whole = cls.from_steps(**steps)
+        whole = cls._of_table(steps)
         if not 0 < early < whole.episodes:
             raise StoreError(
                 f"split={share!r:.60} leaves {early} episodes in front of the cut and {whole.episodes - early} behind "

@@ -284,7 +284,7 @@ def _of_unit_length(rows: np.ndarray, entries: Sequence[int]) -> Iterator[tuple[
     squares = rows[..., list(entries)].reshape(-1, len(entries))[some].T ** 2
     for one, cos in enumerate(entries):
         unit = np.abs(np.sqrt(squares[one] + squares) - 1.0) <= EXACT
-        yield from ((cos, entries[two]) for two in np.flatnonzero(unit.mean(1) >= SHARE / 2) if two != one)
+        yield from ((cos, entries[two]) for two in np.flatnonzero(unit.mean(1) >= SHARE / 2).tolist() if two != one)
 
 
 def _speed_ahead(steps: Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:

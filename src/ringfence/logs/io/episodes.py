@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ringfence.problem.entries import SPACE
 from ringfence.problem.others import others
 
 RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
+BLOCK = 10_000  # rows of episodes that are observed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +63,32 @@ class Motion:
         """(R, axes of the position) m."""
         return self.tracks.state[:, len(self.schema.state) :] - self.place
 
-    def own(self, with_place: bool) -> tuple[list[str], list[np.ndarray]]:
-        """Names and columns (R, ...) of what an agent knows of itself and of its goal."""
+    def own(self, with_place: bool) -> list[Entry]:
+        """What an agent knows of itself and of its goal."""
         schema = self.schema
         hidden = schema.velocity if with_place else (*schema.velocity, *schema.position)
         rest = [name for name in schema.state if name not in hidden]
-        names = [f"own.v{axis}" for axis in schema.axes] + [f"own.{name}" for name in rest]
-        parts = [self.velocity, *(self.column(name)[:, None] for name in rest)]
+        found = [Entry(f"own.v{axis}", self.velocity[:, k]) for k, axis in enumerate(schema.axes)]
+        found += [Entry(f"own.{name}", self.column(name)) for name in rest]
         if schema.goal:
-            names += [f"goal.d{axis}" for axis in schema.position]
-            parts.append(self.to_goal)
-        return names, parts
+            found += [Entry(f"goal.d{axis}", self.to_goal[:, k]) for k, axis in enumerate(schema.position)]
+        return found
+
+
+class Entry(NamedTuple):
+    """One number that each agent of a window sees."""
+
+    name: str
+    column: np.ndarray  # (R,)
+    whose: np.ndarray | None = None  # (N,) of which other agent of the window, by who sees it; None: of oneself
+    relative: bool = False  # to oneself
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """(..., N) in rows (..., N) of the tracks."""
+        if self.whose is None:
+            return self.column[rows]
+        theirs = self.column[rows[..., self.whose]]
+        return theirs - self.column[rows] if self.relative else theirs
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +97,7 @@ class Episodes:
 
     rows: np.ndarray  # (W, N) of the tracks
     lengths: np.ndarray  # (E,) rows of each episode
-    observations: np.ndarray  # (W, N, O)
-    names: list[str]  # of the observations' entries
+    entries: list[Entry]  # O, of observations
     cost: np.ndarray  # (W, N, K)
     notes: tuple[str, ...] = ()
     sensing_radius: float | None = None  # m, of agents who see their neighbours
@@ -106,26 +122,32 @@ class Episodes:
         found[self.last - self.lengths + 1] = False
         return found
 
+    def seen(self, rows: np.ndarray) -> np.ndarray:
+        """(..., N, O) in double precision."""
+        return np.stack([entry.of(rows) for entry in self.entries], -1)
+
+    def observations(self, origins: np.ndarray) -> np.ndarray:
+        """(W, N, O) in single precision, less the origins (O,). They are most of what a store holds, so they are made
+        once, and block by block."""
+        found = np.empty((*self.rows.shape, len(self.entries)), np.float32)
+        with np.errstate(over="ignore"):  # what is too large is refused later, by name
+            for start in range(0, len(found), BLOCK):
+                found[start : start + BLOCK] = self.seen(self.rows[start : start + BLOCK]) - origins
+        return found
+
 
 def team_episodes(motion: Motion) -> Episodes:
     """Episodes of a constant team, of which everybody sees all others."""
     rows, lengths, short = _team_windows(motion)
-    names, parts = motion.own(with_place=True)
-    seen = [np.concatenate(parts, 1)[rows]]
-    n = rows.shape[1]
-    whose = others(n)
+    entries = motion.own(with_place=True)
     columns = _of_others(motion)
-    for j in range(n - 1):
-        for name, column in columns.items():
-            mine = column[rows]
-            theirs = mine[:, whose[:, j]]
-            seen.append((theirs - mine if name in RELATIVE else theirs)[..., None])
-            names.append(f"other{j}.{name}")
+    for j, whose in enumerate(others(rows.shape[1]).T):
+        entries += [Entry(f"other{j}.{name}", column, whose, name in RELATIVE) for name, column in columns.items()]
     cost = motion.tracks.cost[rows]
     if motion.schema.separation is not None:
         cost = _too_close(motion.place[rows], motion.schema.separation.radius)
     notes = (*short, *_left_out(motion, rows))
-    return Episodes(rows, lengths, np.concatenate(seen, -1), names, cost, notes, agents=_members(motion, rows))
+    return Episodes(rows, lengths, entries, cost, notes, agents=_members(motion, rows))
 
 
 def _members(motion: Motion, rows: np.ndarray) -> list[str] | None:
@@ -192,17 +214,22 @@ def _left_out(motion: Motion, rows: np.ndarray) -> tuple[str, ...]:
     """What is in no episode, in sentences."""
     tracks = motion.tracks
     notes = []
-    if rows.shape[1] == 1 and len(np.unique(tracks.agent)) > 1:
+    every, here = (
+        np.bincount(agent.ravel(), minlength=len(motion.agents)) > 0 for agent in (tracks.agent, tracks.agent[rows])
+    )
+    if rows.shape[1] == 1 and every.sum() > 1:
         notes.append(
             "no two agents are there at one time for long enough: episodes are of one agent alone, since recordings "
             "that are separate are no team"
         )
-    share = 1 - len(np.unique(rows)) / len(tracks.step)
+    used = np.zeros(len(tracks.step), bool)
+    used[rows] = True
+    share = 1 - used.mean()
     if share > 0.001:
         notes.append(
             f"{100 * share:.1f} % of the rows are left out: other than {rows.shape[1]} agents, or too short a time"
         )
-    absent = sorted(set(np.unique(tracks.agent)) - set(np.unique(tracks.agent[rows])))
+    absent = np.flatnonzero(every & ~here).tolist()
     if absent:
         named = ", ".join(str(motion.agents[k]) for k in absent[:5]) + (", ..." if len(absent) > 5 else "")
         notes.append(f"agents that are in no episode, so that nobody will see them: {named}")
@@ -228,15 +255,14 @@ def neighbour_episodes(motion: Motion) -> Episodes:
     drift = np.where(seen[..., None], motion.velocity[near] - motion.velocity[:, None], 0.0)
     radius = schema.sensing_radius or float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
     offset[~seen] = np.eye(offset.shape[-1])[0] * radius  # nobody is as far as one sees
-    names, parts = motion.own(with_place=False)
+    entries = motion.own(with_place=False)
     for j in range(schema.neighbours):
-        parts += [offset[:, j], drift[:, j], seen[:, j, None].astype(float)]
-        names += [f"other{j}.d{axis}" for axis in schema.position]
-        names += [f"other{j}.dv{axis}" for axis in schema.axes]
-        names.append(f"other{j}.seen")
+        entries += [Entry(f"other{j}.d{axis}", offset[:, j, k]) for k, axis in enumerate(schema.position)]
+        entries += [Entry(f"other{j}.dv{axis}", drift[:, j, k]) for k, axis in enumerate(schema.axes)]
+        entries.append(Entry(f"other{j}.seen", seen[:, j].astype(float)))
     cost = tracks.cost
     if schema.separation is not None:
         close = np.linalg.norm(offset[:, 0], axis=-1) < schema.separation.radius
         cost = (close & seen[:, 0]).astype(float)[:, None]
     rows = index[:, None]
-    return Episodes(rows, lengths, np.concatenate(parts, 1)[rows], names, cost[rows], notes, float(radius))
+    return Episodes(rows, lengths, entries, cost[rows], notes, float(radius))

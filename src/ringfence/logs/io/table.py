@@ -46,6 +46,7 @@ from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample
 from ringfence.logs.io.units import in_metres, without_angles
 from ringfence.logs.io.wide import read_wide
+from ringfence.logs.moving import looked_at, origins_of
 from ringfence.problem.constraints import CostColumn
 
 USUAL = 0.999  # of accelerations, that are no outliers
@@ -87,7 +88,7 @@ LAYOUTS = {
 def read_table(
     table: Tables, schema: TableSchema, *, notes: Sequence[str] = (), card: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """What `EpisodeStore.from_steps` takes, of a table with a row per agent and time, in any order of agents; each
+    """What an `EpisodeStore` is made of, of a table with a row per agent and time, in any order of agents; each
     agent's times increase. Several tables are recordings of their own: no episode is of two, and rows are counted over
     all of them.
 
@@ -132,10 +133,7 @@ def read_parts(
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
     warnings = [*notes, *metres, *angles, *repeated, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
-    steps = _steps(motion, episodes, warnings, card or {})
-    if lost:  # what the table has lost is not found again by moving it
-        steps |= {name: steps[name].astype(np.float32) for name in ("observations", "final_observations")}
-    return steps, int(early.sum())
+    return _arrays(motion, episodes, warnings, card or {}, lost), int(early.sum())
 
 
 def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
@@ -285,8 +283,10 @@ def _made_of(schema: TableSchema) -> Iterator[str]:
         yield "actions are accelerations, differences of velocities"
 
 
-def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mapping[str, Any]) -> dict[str, Any]:
-    """What `EpisodeStore.from_steps` takes."""
+def _arrays(
+    motion: Motion, episodes: Episodes, warnings: list[str], card: Mapping[str, Any], lost: bool
+) -> dict[str, Any]:
+    """What an `EpisodeStore` is made of. What the table has `lost` is not found again by moving it."""
     schema = motion.schema
     costs = episodes.cost[episodes.arrives]
     if _of_team(costs, schema.homogeneous):
@@ -307,7 +307,7 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
         ]
     facts = {
         "task": "table",
-        "observation_names": episodes.names,
+        "observation_names": [entry.name for entry in episodes.entries],
         "hazard": schema.danger or CostColumn(),
         "dt": motion.tracks.dt,
         "warnings": warnings,
@@ -319,13 +319,19 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
     if schema.homogeneous:
         facts |= {"homogeneous": True, "sensing_radius": episodes.sensing_radius}
     named = len(schema.cost) > 1
+    ends = np.cumsum(episodes.lengths - 1)
+    rows = looked_at(ends)
+    origins = None
+    if not lost and "observation_origins" not in card:
+        before, after = (episodes.seen(episodes.rows[each]) for each in (rows, rows + 1))
+        origins = origins_of({"observations": (before, after)}).get("observations")
     return {
-        "observations": episodes.observations[episodes.leaves],
+        "observations": episodes.observations(np.zeros(len(episodes.entries)) if origins is None else origins),
+        "origins": origins,
         "actions": actions,
         "rewards": _rewards(motion, episodes)[episodes.arrives],
         "costs": dict(zip(schema.cost, np.moveaxis(costs, -1, 0))) if named else costs[..., 0],
-        "episode_ends": np.cumsum(episodes.lengths - 1),
-        "final_observations": episodes.observations[episodes.last],
+        "episode_ends": ends,
         "terminated": motion.tracks.ended[episodes.rows[episodes.last]].any(1),
         "card": {**facts, **card},
     }
