@@ -22,8 +22,8 @@ from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
 from ringfence.world import barrier as cbf
-from ringfence.world import margins, validate
-from tests.quick import QUICK_WORLD
+from ringfence.world import judging, margins
+from tests.quick import IN_FULL, QUICK_WORLD
 
 
 def with_costs(store, costs, task="mine"):
@@ -131,7 +131,6 @@ class Head(eqx.Module):
         return after[..., 0]
 
 
-@pytest.mark.judged
 def test_the_card_says_how_far_ahead_danger_is_decided():
     """Cars that close in at 1 m/s stop in half a metre: from five steps before it is too late, from seven it is not."""
     gap = 1.93 - 0.1 * np.arange(21)
@@ -139,8 +138,8 @@ def test_the_card_says_how_far_ahead_danger_is_decided():
     arrays = {"features": jnp.asarray(x, jnp.float32), "actions": jnp.zeros((20, 2, 1))}
     arrays |= {"row": np.arange(20), "first_row": np.zeros(20, int), "last_row": np.full(20, 20)}
     entered = np.array([19])  # the step that ends with a gap below 0
-    found = validate._avoidable(Head(), Head(), arrays, entered)
-    assert found.before == validate.BEFORE[:-1] and found.rows == 7  # the log is 20 steps long
+    found = judging._avoidable(Head(), Head(), arrays, entered, IN_FULL)
+    assert found.before == IN_FULL.before[:-1] and found.rows == 7  # the log is 20 steps long
     assert found.avoided == (0, 0, 0, 0, 1, 1, 1, 1)
 
 

@@ -17,41 +17,42 @@ from ringfence.proposals.base import held
 from ringfence.types import Array
 from ringfence.utils.device import on_device
 from ringfence.world import World, cause_candidates
+from ringfence.world.card import UNKNOWN
 from ringfence.world.cause_counts import Explained, counted, some_steps
 from ringfence.world.causes import Cause
 from ringfence.world.cells import Cells
+from ringfence.world.judging import Judging
 from ringfence.world.logged import Logged
 
-STATES = 128  # held-out safe states from which actions are searched
 FEW = 10  # safe steps of what was found, with fewer of which nothing is said
 SURE = 0.8  # probability that being in a cell makes a step unsafe, from which on what was found there counts as wrong
-SHIELD = GuardOptions(correction_steps=10, correction_restarts=1, margin=1.0)
 
 
-def false_safe(world: World, logged: Logged) -> float | None:
+def false_safe(world: World, logged: Logged, judging: Judging) -> float:
     """The share of predicted steps that a shield's search calls safe, and that the logs call dangerous: somebody is in
-    a place, or as near to something, as hardly any safe step was. None where names tell no places."""
-    known = [] if world.barrier is None else _known(logged)
+    a place, or as near to something, as hardly any safe step was. UNKNOWN where names tell no places."""
+    known = [] if world.barrier is None or not judging.searched else _known(logged)
     if not known:
-        return None
+        return UNKNOWN
     rng = np.random.default_rng(3)
     steps = logged.held_steps
     safe = steps[~logged.unsafe[steps]]
     close = np.intersect1d(safe, np.flatnonzero(logged.close_to_danger()))
-    picked = [rng.choice(these, min(STATES // 2, len(these)), replace=False) for these in (close, safe)]
+    picked = [rng.choice(these, min(judging.searched // 2, len(these)), replace=False) for these in (close, safe)]
     begun = np.concatenate(picked)
     if len(begun) < FEW:
-        return None
+        return UNKNOWN
     present = logged.before(begun)
     agents, entries = logged.arrays["actions"].shape[1:]
     wanted = rng.choice((-1.0, 0.0, 1.0), (len(present), agents, entries)).astype(np.float32)
-    guard = Guard(BarrierSource(world, "learned", None, False), SHIELD)
+    options = GuardOptions(correction_steps=judging.corrections, correction_restarts=judging.restarts, margin=1.0)
+    guard = Guard(BarrierSource(world, "learned", None, False), options)
     rows, met = _searched(guard, on_device(present), on_device(wanted))
     found = np.asarray(rows)[np.asarray(met)]  # (found, K, N, D)
     if len(found) < FEW:
-        return None
+        return UNKNOWN
     wrong = np.logical_or.reduce([_dangerous(one, found) for one in known])
-    return float(wrong.mean())
+    return round(float(wrong.mean()), 4)
 
 
 @eqx.filter_jit

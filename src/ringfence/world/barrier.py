@@ -71,6 +71,11 @@ class Barrier(eqx.Module):
     shape: Shape
     causes: tuple[Score, ...] = ()  # ℓ by causes, where they were found; `label` is empty then
 
+    @property
+    def each(self) -> tuple[Barrier, ...]:
+        """Itself, as of the one constraint."""
+        return (self,)
+
     def of_steps(self, before: Array, after: Array) -> Array:
         """ℓ (..., N) of steps from features (..., N, D) to others."""
         if self.causes:

@@ -26,9 +26,9 @@ from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
 from ringfence.world.card import Card
 from ringfence.world.causes import Found
-from ringfence.world.look import look_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
+from ringfence.world.verdict import look_of
 
 # (task, view, hazard) -> the view of a simulated task; None of own data, whose file says all of it
 MapOf = Callable[[str, features.View, dict], features.FeatureMap | None]
