@@ -41,10 +41,10 @@ from ringfence.world.card import (
     ValueScores,
     Verdict,
 )
-from ringfence.world.cause_nets import FAR, LEAST, blank, scores, values_of, with_margin
-from ringfence.world.causes import Cause, Edge, Found
+from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
+from ringfence.world.causes import SLOPED, Cause, Edge, Found
 from ringfence.world.cells import Cells
-from ringfence.world.heading import Heading
+from ringfence.world.dynamics import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
 from tests.quick import IN_FULL, QUICK_WORLD
 
@@ -130,7 +130,7 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     assert edge.below and abs(edge.at - 3.0) < 0.05 and abs(edge.at / cause.ratio - 0.5) < 0.01
     assert found.explained > 0.9 and found.false_alarms < 0.01
     x = others[:50].reshape(50, N, -1)
-    np.testing.assert_allclose(cause.of(x), values_of(cause, jnp.asarray(x)), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(cause.of(x), cause.of(jnp.asarray(x), SLOPED), rtol=1e-4, atol=1e-4)
     loaded = msgspec.json.decode(msgspec.json.encode(found), type=Found)
     assert loaded == found
 
@@ -189,9 +189,9 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     elif what != "strip":  # what is in one number has two edges
         near, second = {"fast": (5.0, 3.0), "head-on": (12.0, 3.0)}.get(what, (8.0, np.arccos(0.7)))
         assert abs(at - near) < 0.1 and abs(found.causes[0].second_edge(at) - second) < 0.05
-    np.testing.assert_allclose(found.causes[0].of(x), values_of(found.causes[0], jnp.asarray(x)), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(found.causes[0].of(x), found.causes[0].of(jnp.asarray(x), SLOPED), rtol=1e-3, atol=1e-3)
     here = jnp.zeros((N, x.shape[-1]))
-    assert np.isfinite(jax.grad(lambda x: values_of(found.causes[0], x).sum())(here)).all()
+    assert np.isfinite(jax.grad(lambda x: found.causes[0].of(x, SLOPED).sum())(here)).all()
 
 
 def test_what_has_room_for_one_is_dangerous_for_two():
@@ -205,7 +205,7 @@ def test_what_has_room_for_one_is_dangerous_for_two():
     assert cause.name == "other.place, own.place"
     assert found.explained > 0.9 and found.false_alarms < 0.1
     np.testing.assert_allclose(cause.of(x)[:, 0, 0], place[:, :2].reshape(30_000, 4), atol=1e-5)
-    np.testing.assert_allclose(values_of(cause, jnp.asarray(x)), cause.of(x), atol=1e-5)
+    np.testing.assert_allclose(cause.of(jnp.asarray(x), SLOPED), cause.of(x), atol=1e-5)
 
 
 def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
@@ -217,7 +217,7 @@ def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
     x = np.random.default_rng(0).normal(0, 2, (50, 1, 3)).astype(np.float32)
     looks = np.concatenate([x[..., :2], np.cos(x[..., 2:]), np.sin(x[..., 2:])], -1)
     np.testing.assert_allclose(ahead.of(looks), angle.of(x), atol=1e-5)
-    np.testing.assert_allclose(values_of(angle, jnp.asarray(x)), angle.of(x), atol=1e-5)
+    np.testing.assert_allclose(angle.of(jnp.asarray(x), SLOPED), angle.of(x), atol=1e-5)
 
 
 def test_danger_that_nothing_tells_has_no_cause(logged):

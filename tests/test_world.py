@@ -21,8 +21,8 @@ from ringfence.loading import run_worlds
 from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
+from ringfence.world import Settings, judging, margins
 from ringfence.world import barrier as cbf
-from ringfence.world import judging, margins
 from tests.quick import IN_FULL, QUICK_WORLD
 
 
@@ -198,11 +198,11 @@ def test_the_worst_agent_explains_the_teams_cost():
     map = FeatureMap("pruned", names, "observations", table, table * 0 - 1)
     near = np.linalg.norm(gap, axis=-1).min(-1) < 0.3  # (M, N)
     unsafe = near.any(-1)[1:]
-    blank = cbf.blank_barrier(map, 32)
+    settings = Settings(barrier_updates=800, barrier_width=32)
+    blank = cbf.blank_barrier(map, settings)
     data = jnp.asarray(x), jnp.asarray(x[1:]), jnp.arange(len(x) - 1), jnp.asarray(unsafe)
     steps = np.arange(len(x) - 1)
-    settings = dict(loss="cross-entropy", updates=800, width=32)
-    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), **settings)
+    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), settings)
     h = np.asarray(fitted.of_steps(jnp.asarray(x), jnp.asarray(x)))
     assert ((h < 0) == near).mean() > 0.95  # each agent's own danger, though no label named it
     assert np.abs(h).max() <= cbf.FARTHEST
@@ -218,16 +218,16 @@ def test_danger_is_seen_ahead():
     row = (np.arange(episodes)[:, None] * (steps + 1) + np.arange(steps)).ravel()
     unsafe = rows[row + 1, 0, 0] > 0.8
     table = np.zeros((1, 2), int)
-    blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), 32)
-    settings = dict(loss="cross-entropy", updates=500, width=32)
+    settings = Settings(barrier_updates=500, barrier_width=32, future_discount=0.9, expectile=0.9, future_updates=1)
+    blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), settings)
     data = jnp.asarray(rows), jnp.asarray(rows[row + 1]), jnp.asarray(row), jnp.asarray(unsafe)
     every = np.arange(len(row))
-    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **settings)
+    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), settings)
     arrays = {"features": data[0], "row": data[2], "terminated": jnp.zeros(len(row), bool)}
-    settings = dict(discount=0.9, expectile=0.9)
-    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), updates=1, **settings)
+    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), settings)
     np.testing.assert_allclose(start.ahead(data[0]), fitted.of_steps(data[0], data[0]), atol=1.0)  # it begins as ℓ
-    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), updates=1000, **settings)
+    settings = dataclasses.replace(settings, future_updates=1000)
+    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), settings)
     doomed, fine = jnp.asarray([[[0.4, 0.9]]]), jnp.asarray([[[0.4, -0.9]]])
     assert fitted.of_steps(doomed, doomed) > 0 and fitted.of_steps(fine, fine) > 0
     assert ahead.ahead(doomed) < 0 < ahead.ahead(fine)

@@ -3,8 +3,6 @@ the pockets in which the World is wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -73,8 +71,10 @@ def _searched(guard: Guard, present: Array, wanted: Array) -> tuple[Array, Array
 
 def _known(logged: Logged) -> list[Cells]:
     """Where the logs have danger: one's own place, and how far things are, as names tell, counted cell by cell."""
-    names = logged.map.names
-    simple = [*_own_place(names), *cause_candidates.offsets(names)]
+    names = list(logged.map.names)
+    simple = cause_candidates.offsets(names)
+    if {"own.x", "own.y"} <= set(names):
+        simple.insert(0, Cause("own.x, own.y", ((names.index("own.x"), names.index("own.y")),)))
     if not simple:
         return []
     steps = np.arange(logged.store.steps)
@@ -82,12 +82,6 @@ def _known(logged: Logged) -> list[Cells]:
     counts = some_steps(x, logged.label, logged.store.episode_of_step, np.random.default_rng(0))
     nothing = Explained.by(counts, [])
     return [counted(counts, cause, nothing).cells for cause in simple]
-
-
-def _own_place(names: Sequence[str]) -> list[Cause]:
-    if not {"own.x", "own.y"} <= set(names):
-        return []
-    return [Cause("own.x, own.y", (tuple(list(names).index(name) for name in ("own.x", "own.y")),))]
 
 
 def _dangerous(cells: Cells, x: np.ndarray) -> np.ndarray:

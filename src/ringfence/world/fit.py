@@ -32,16 +32,14 @@ from ringfence.utils.progress import Parts
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
 from ringfence.world import cause_search, dynamics, impacts, judging, margins, values
-from ringfence.world.card import Card, Data
+from ringfence.world.card import Card, Data, Settings
 from ringfence.world.cause_candidates import offsets
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import Found
 from ringfence.world.cells import Cells
-from ringfence.world.heading import AHEAD, Heading
+from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
-from ringfence.world.model import World
-from ringfence.world.settings import Settings
-from ringfence.world.storage import blank_barrier, blank_world, load, save
+from ringfence.world.model import World, blank_world, load, save
 
 FORMAT = 6  # of what is fitted, found and told: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
@@ -178,7 +176,7 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
     """A World that nobody has judged, whose card says of what it is; and the logs that are to judge it, with a tenth of
     the episodes held out of every part: as they were learned from, cut at impacts, and as they are."""
     store, map, settings = of.store, of.map, of.settings
-    if settings.execution == "decentralized":
+    if settings.alone:
         map = features.alone(map)
     labels = labels_of(store, map, settings, of.hazard) if settings.barrier else {}
     out = held_out(store, of.seed, unsafe_of(labels) if labels else None)
@@ -186,14 +184,14 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
     arrays = store.digest("observations", "state", "actions", "episode_ends", "terminated")
     moved = [arrays, _digest(out), store.card.bounds, map.turns, _digest(map.plus), _digest(map.minus)]
 
-    world = blank_world(map, of.spec, settings)
-    value = _values(logged, moved, world.values, of)
+    blank = blank_world(map, of.spec, settings)
+    value = _values(logged, moved, blank.values, of)
     thrown = impacts.count(logged, of.seed) if labels and settings.labels == "costs" else 0
     steps = logged.fitted_steps
     if thrown:
         steps = steps[~logged.unsafe[steps]]
         moved.append(_digest(logged.unsafe))
-    acts = _dynamics(logged, steps, moved, world.dynamics, of)
+    acts = _dynamics(logged, steps, moved, blank.dynamics, of)
     if map.mirrored:
         acts = _with_partners(acts, logged, steps, moved, of)
         moved.append(acts.map.mirrored)
@@ -208,8 +206,8 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
         shape=_shape_in_words(barrier),
         causes=causes,
     )
-    alone = settings.execution == "decentralized"
-    return World(acts, value, barrier, jnp.ones(()), map, of.spec, alone, card), logged, as_they_are
+    world = World(acts, value, barrier, jnp.ones(()), map, of.spec, settings.alone, card)
+    return world, logged, as_they_are
 
 
 def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> Data:
@@ -289,26 +287,13 @@ def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
 
 
 def _dynamics(
-    logged: Logged,
-    steps: np.ndarray,
-    moved: list[Any],
-    blank: dynamics.Dynamics,
-    of: Fit,
+    logged: Logged, steps: np.ndarray, moved: list[Any], blank: dynamics.Dynamics, of: Fit
 ) -> dynamics.Dynamics:
     """Of these steps."""
-    settings = of.settings
 
     def fit(key: Key) -> dynamics.Dynamics:
-        return dynamics.fit_dynamics(
-            logged.arrays["features"],
-            on_device(logged.picked("actions", steps)),
-            on_device(logged.picked("row", steps)),
-            blank.map,
-            key,
-            num_ensemble=settings.num_ensemble,
-            updates=settings.dynamics_updates,
-            width=settings.dynamics_width,
-        )
+        actions, row = (on_device(logged.picked(name, steps)) for name in ("actions", "row"))
+        return dynamics.fit_dynamics(logged.arrays["features"], actions, row, blank.map, key, of.settings)
 
     return of.part("dynamics", moved, blank, fit)
 
@@ -318,63 +303,106 @@ def _with_partners(
 ) -> dynamics.Dynamics:
     """The dynamics that read what those do who are in lists of the nearest, if they predict held-out windows better
     than plain ones: in long lists they learn by heart who does what."""
-    settings = of.settings
     action = logged.arrays["actions"].shape[-1]
-    blank = dynamics.blank_dynamics(logged.map, action, settings.num_ensemble, settings.dynamics_width)
+    blank = dynamics.blank_dynamics(logged.map, action, of.settings.num_ensemble, of.settings.dynamics_width)
     told = _dynamics(logged, steps, [*moved, logged.map.mirrored], blank, of)
-    errors = [
-        judging.prediction_error(each, logged, np.random.default_rng(4), judging.JUDGING) for each in (told, plain)
-    ]
+    asked = judging.JUDGING
+    errors = [judging.prediction_error(each, logged, np.random.default_rng(4), asked) for each in (told, plain)]
     ours, theirs = (np.mean(error.error_of_change) for error in errors)
     return told if ours < theirs else plain
 
 
 def _values(logged: Logged, moved: list[Any], blank: values.Values, of: Fit) -> values.Values:
     settings = of.settings
-    alone = settings.execution == "decentralized"
 
     def fit(key: Key) -> values.Values:
-        return values.fit_values(
-            logged.arrays | {"returns_to_go": logged.returns_to_go(settings.discount, alone)},
-            on_device(logged.fitted_steps),
-            logged.map,
-            key,
-            discount=settings.discount,
-            updates=settings.value_updates,
-            period=logged.longest,
-            alone=alone,
-        )
+        arrays = logged.arrays | {"returns_to_go": logged.returns_to_go(settings.discount, settings.alone)}
+        return values.fit_values(arrays, on_device(logged.fitted_steps), logged.map, key, settings, logged.longest)
 
     return of.part("values", [*moved, logged.store.digest("rewards")], blank, fit)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """The search for the causes of one constraint's danger, made at most once."""
+class _Danger:
+    """The danger of one constraint, of which a barrier is made."""
 
     logged: Logged
-    seed: int
+    moved: list[Any]
+    acts: dynamics.Dynamics
+    of: Fit
+
+    def barrier(self) -> tuple[Found, cbf.Barrier]:
+        """Its causes, and ℓ and V by them; no causes, and networks on all entries, where held-out steps say that
+        these tell more."""
+        found = self.causes()
+        label = self.label(found)
+        if found.causes and (recall := self._recall(label)) < ENOUGH:
+            plain = self.label(Found())
+            if self._recall(plain) > recall:
+                found, label = Found(), plain
+        return found, self.with_future(label, found)
+
+    def _recall(self, label: cbf.Barrier) -> float:
+        return judging.recall(label, self.logged, judging.JUDGING)
+
+    def causes(self) -> Found:
+        """None where few entries do not explain it, or where it is of a whole body."""
+        settings = self.of.settings
+        plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
+        if not plain or self.logged.map.shared_body or self.logged.map.joint:
+            return Found()
+        found = self.of.found("causes", self._content(), Found, lambda: self.search[0])
+        return found if found.explained >= EXPLAINED else Found()
 
     @functools.cached_property
-    def result(self) -> tuple[Found, list[Cells]]:
-        """What is found, and the cells of each cause."""
+    def search(self) -> tuple[Found, list[Cells]]:
+        """What a search for causes finds, and the cells of each; made at most once."""
         logged = self.logged
         steps = logged.fitted_steps
-        x = logged.after(steps)
         episode = logged.store.episode_of_step[steps]
-        return cause_search.find(x, logged.label[steps], episode, logged.map.names, self.seed)
+        return cause_search.find(logged.after(steps), logged.label[steps], episode, logged.map.names, self.of.seed)
 
+    def _content(self, *found: Found) -> list[Any]:
+        """What a barrier is made of, beside its settings."""
+        return [*self.moved, _digest(self.logged.label), self.logged.map.names, *found]
 
-def _causes(search: _Search, moved: list[Any], of: Fit) -> Found:
-    """The causes of one constraint's danger; none where few entries do not explain it, or is of a whole body."""
-    settings = of.settings
-    logged = search.logged
-    plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
-    if not plain or logged.map.shared_body or logged.map.joint:
-        return Found()
-    content = [*moved, _digest(logged.label), logged.map.names]
-    found = of.found("causes", content, Found, lambda: search.result[0])
-    return found if found.explained >= EXPLAINED else Found()
+    def _blank(self, found: Found) -> cbf.Barrier:
+        return eqx.filter_eval_shape(cbf.blank_barrier, self.logged.map, self.of.settings, found)
+
+    def label(self, found: Found) -> cbf.Barrier:
+        """ℓ, with the statistics that it reads by."""
+        return self.of.part("label", self._content(found), self._blank(found), lambda key: self._label(found, key))
+
+    def _label(self, found: Found, key: Key) -> cbf.Barrier:
+        logged = self.logged
+        settings = self.of.settings
+        key_states, key_fit = jax.random.split(key)
+        steps = logged.fitted_steps
+        unsafe = logged.unsafe[steps]
+        if unsafe.all() or not unsafe.any():
+            raise UserError(
+                f"All unsafe steps of '{logged.store.card.task}' lie in the episodes that are held out; log more of "
+                "them, or take another seed."
+            )
+        arrays = logged.arrays
+        data = arrays["features"], logged.predicted(self.acts), arrays["row"], on_device(logged.label)
+        given = data, steps[unsafe], steps[~unsafe], key_fit, settings
+        blank = _standardised(cbf.blank_barrier(logged.map, settings, found), logged, key_states)
+        if not found.causes:
+            return cbf.fit_label(blank, *given)
+        nets = fit_causes(found, self.search[1], *given)
+        nets = margins.in_own_margins(nets, self.acts, logged, np.random.default_rng(0))
+        return dataclasses.replace(blank, causes=nets)
+
+    def with_future(self, label: cbf.Barrier, found: Found) -> cbf.Barrier:
+        """V beside ℓ."""
+        steps = self.logged.fitted_steps
+        close = steps[self.logged.close_to_danger()[steps]]
+
+        def fit(key: Key) -> cbf.Barrier:
+            return cbf.fit_future(label, self.logged.arrays, steps, close, key, self.of.settings)
+
+        return self.of.part("future", self._content(found), self._blank(found), fit)
 
 
 def _digest(array: np.ndarray) -> str:
@@ -385,104 +413,12 @@ def _barrier(
     logged: Logged, names: tuple[str, ...], moved: list[Any], acts: dynamics.Dynamics, of: Fit
 ) -> tuple[cbf.Barrier | cbf.MinBarrier | None, dict[str, Found]]:
     """The barrier of all constraints, and the causes of the danger of each; None where there are none."""
-    searches = {name: _Search(logged.by(name), of.seed) for name in names}
-    labels = {name: _label_of(search, moved, acts, of) for name, search in searches.items()}
-    causes = {name: found for name, (found, _) in labels.items()}
-    each = [_with_future(labels[name][1], search, moved, causes[name], of) for name, search in searches.items()]
+    made = {name: _Danger(logged.by(name), moved, acts, of).barrier() for name in names}
+    causes = {name: found for name, (found, _) in made.items()}
+    each = tuple(barrier for _, barrier in made.values())
     if not each:
         return None, causes
-    return cbf.MinBarrier(tuple(each), names) if logged.several else each[0], causes
-
-
-def _label_of(search: _Search, moved: list[Any], acts: dynamics.Dynamics, of: Fit) -> tuple[Found, cbf.Barrier]:
-    """The causes of one constraint's danger, and ℓ by them; no causes, and ℓ by networks on all entries, where held-out
-    steps say that these tell more."""
-    found = _causes(search, moved, of)
-    label = _labelled(search, moved, acts, found, of)
-    if not found.causes:
-        return found, label
-    recall = judging.recall(label, search.logged, judging.JUDGING)
-    if not recall < ENOUGH:
-        return found, label
-    plain = _labelled(search, moved, acts, Found(), of)
-    if judging.recall(plain, search.logged, judging.JUDGING) > recall:
-        return Found(), plain
-    return found, label
-
-
-def _labelled(search: _Search, moved: list[Any], acts: dynamics.Dynamics, found: Found, of: Fit) -> cbf.Barrier:
-    """ℓ of one constraint."""
-    content = _about(search, moved, found)
-    template = eqx.filter_eval_shape(blank_barrier, search.logged.map, of.settings, found)
-    return of.part("label", content, template, lambda key: _label(search, acts, of.settings, found, key))
-
-
-def _about(search: _Search, moved: list[Any], found: Found) -> list[Any]:
-    """What a barrier is made of, beside its settings."""
-    return [*moved, _digest(search.logged.label), search.logged.map.names, found]
-
-
-def _with_future(label: cbf.Barrier, search: _Search, moved: list[Any], found: Found, of: Fit) -> cbf.Barrier:
-    """ℓ and V of one constraint."""
-    settings = of.settings
-    logged = search.logged
-    steps = logged.fitted_steps
-
-    def fit(key: Key) -> cbf.Barrier:
-        return cbf.fit_future(
-            label,
-            logged.arrays,
-            steps,
-            steps[logged.close_to_danger()[steps]],
-            key,
-            discount=settings.future_discount,
-            expectile=settings.expectile,
-            updates=settings.future_updates,
-        )
-
-    template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
-    return of.part("future", _about(search, moved, found), template, fit)
-
-
-def _label(search: _Search, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key) -> cbf.Barrier:
-    """ℓ of a data set, with the statistics that it reads by."""
-    logged = search.logged
-    key_states, key_fit = jax.random.split(key)
-    steps = logged.fitted_steps
-    unsafe = logged.unsafe[steps]
-    if unsafe.all() or not unsafe.any():
-        raise UserError(
-            f"All unsafe steps of '{logged.store.card.task}' lie in the episodes that are held out; log more of "
-            "them, or take another seed."
-        )
-    data = logged.arrays["features"], logged.predicted(acts), logged.arrays["row"], on_device(logged.label)
-    blank = _standardised(blank_barrier(logged.map, settings, found), logged, key_states)
-    if found.causes:
-        nets = fit_causes(
-            found,
-            search.result[1],
-            data,
-            steps[unsafe],
-            steps[~unsafe],
-            key_fit,
-            share=settings.predicted_share,
-            updates=settings.barrier_updates,
-            width=settings.barrier_width,
-        )
-        nets = margins.in_own_margins(nets, acts, logged, np.random.default_rng(0))
-        return dataclasses.replace(blank, causes=nets)
-    return cbf.fit_label(
-        blank,
-        data,
-        steps[unsafe],
-        steps[~unsafe],
-        key_fit,
-        loss=settings.loss,
-        penalty=settings.penalty,
-        share=settings.predicted_share,
-        updates=settings.barrier_updates,
-        width=settings.barrier_width,
-    )
+    return cbf.MinBarrier(each, names) if logged.several else each[0], causes
 
 
 def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier:

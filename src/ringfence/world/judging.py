@@ -28,6 +28,7 @@ from ringfence.world.card import (
     HeldOut,
     MarginScores,
     PredictionError,
+    Settings,
     Threshold,
     ValueScores,
 )
@@ -45,7 +46,6 @@ from ringfence.world.margins import (
     widening,
 )
 from ringfence.world.model import World
-from ringfence.world.settings import Settings
 from ringfence.world.values import Values
 
 SCORED = 20_000  # steps that are scored at once

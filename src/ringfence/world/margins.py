@@ -140,7 +140,6 @@ def widening(
     of_ends = scored(logged.before(bad), logged.after(bad))
     of_safe = scored(logged.before(fine), logged.after(fine))
     blamed = (of_ends.argmin(-1)[:, None] == np.arange(of_ends.shape[1])) & (of_ends < 1.0)
-    bearable = np.quantile(of_safe, 1 - BEARABLE, axis=0)
     asked = [np.zeros(of_ends.shape[1])]
     for k in ahead:
         known = _begun(logged, bad, k - 1)
@@ -151,8 +150,7 @@ def widening(
         for c in range(len(wanted)):
             mine = ends[blamed[known, c], c]
             if len(mine) >= ENTRIES:
-                missed = max(MISSED, OUTLIERS / len(mine))
-                wanted[c] = max(wanted[c], min(conformal(mine, 1 - missed), bearable[c]) - 1.0)
+                wanted[c] = max(wanted[c], _own_margin(mine, of_safe[:, c]) - 1.0)
         asked.append(wanted)
     at = np.array([JUDGED, *ahead][: len(asked)])
     every = np.arange(1, at[-1] + 1)
@@ -195,8 +193,10 @@ def _least(net: Score, x: Array) -> Array:
 
 def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: np.ndarray) -> Score:
     predicted = scores_of_ends(lambda _, after: _least(net, after), dynamics, logged, ends)
+    return with_margin(net, max(_own_margin(predicted, np.asarray(_least(net, safe))), least_margin(net)))
+
+
+def _own_margin(predicted: np.ndarray, safe: np.ndarray) -> float:
+    """The conformal margin of a cause's entries into danger; what cannot be foreseen is not bought by any."""
     missed = max(MISSED, OUTLIERS / len(predicted))
-    of_safe = np.asarray(_least(net, safe))
-    bearable = float(np.quantile(of_safe, 1 - BEARABLE))  # what cannot be foreseen is not bought by any margin
-    margin = min(conformal(predicted, 1 - missed), bearable)
-    return with_margin(net, max(margin, least_margin(net)))
+    return min(conformal(predicted, 1 - missed), float(np.quantile(safe, 1 - BEARABLE)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.problem.entries import Entries
 from ringfence.types import Array
-from ringfence.world import cause_candidates, cause_edges
+from ringfence.world import cause_candidates, cause_counts
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import UNKNOWN, Probe, ProbeMap
 from ringfence.world.cause_nets import Score
@@ -155,7 +155,7 @@ def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Ed
         return [(net.cause, net.edge) for net in nets if net.cause.is_distance]
     steps = logged.fitted_steps
     told = logged.after(steps), logged.label[steps], logged.store.episode_of_step[steps]
-    return [(cause, cause_edges.radius(*told, cause)) for cause in cause_candidates.offsets(logged.map.names)]
+    return [(cause, cause_counts.radius(*told, cause)) for cause in cause_candidates.offsets(logged.map.names)]
 
 
 def _put(
