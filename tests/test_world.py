@@ -23,7 +23,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
 from ringfence.world import Settings, judging, margins
 from ringfence.world import barrier as cbf
-from tests.quick import IN_FULL, QUICK_WORLD
+from tests.quick import IN_FULL, LITTLE, QUICK_WORLD
 
 
 def with_costs(store, costs, task="mine"):
@@ -98,6 +98,16 @@ def test_a_cache_that_takes_no_world_is_said(small_store, monkeypatch, tmp_path)
     with pytest.raises(UserError, match="No space left.*free some space or set RINGFENCE_HOME"):
         worlds.fit(small_store, **QUICK_WORLD)
     assert not list(tmp_path.rglob("*.safetensors")) and not list(tmp_path.rglob("*.part"))
+
+
+def test_what_judges_a_world_is_set_and_kept_apart(small_store, small_world, monkeypatch):
+    """Of the same parts: a card says what was asked."""
+    monkeypatch.setattr(judging, "JUDGING", dataclasses.replace(LITTLE, ahead=2))
+    again = worlds.fit(small_store, **QUICK_WORLD)
+    assert again.card.prediction_error.steps_ahead == (1, 2)
+    assert small_world.card.prediction_error.steps_ahead == tuple(range(1, LITTLE.ahead + 1))
+    assert eqx.tree_equal(again.dynamics.net, small_world.dynamics.net)
+    assert again.card.barrier.avoidable is None and np.isnan(again.card.barrier.searched), "none is asked about"
 
 
 def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):

@@ -184,8 +184,9 @@ def _standardised(net: Score, cells: Cells) -> Score:
         given = [on_device(a, np.float32) for a in (np.array(net.edge.bounds) / span, span, sharp)]
         return eqx.tree_at(lambda n: (n.bounds, n.scale, n.log_gain), net, given)
     centres, _ = cells.known()
-    spread = np.maximum(centres.std(0), 1e-6)
-    if cells.cause.width > 1 and _alike(centres.std(0)):
+    deviation = centres.std(0)
+    spread = np.maximum(deviation, 1e-6)
+    if cells.cause.width > 1 and deviation.max() < 2 * deviation.min():  # as axes of a place do: directions are kept
         spread = np.full_like(spread, spread.mean())
     statistics = [on_device(a, np.float32) for a in (centres.mean(0), spread)]
     return eqx.tree_at(lambda n: (n.mean, n.scale), net, statistics)
@@ -207,8 +208,3 @@ def least_margin(net: Score) -> float:
     if isinstance(net, CauseNet):
         return LEAST
     return float(jnp.exp(net.log_gain)) * 0.5 / CELLS[1]
-
-
-def _alike(spread: np.ndarray) -> bool:
-    """Whether entries vary by about as much, as the axes of a place do: then directions are kept."""
-    return bool(spread.max() < 2 * spread.min())

@@ -191,7 +191,8 @@ def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Co
         told = gain(steps, explained, Explained.by(steps, parts).safe)[0]
         less = told < (1 - SIMPLER) * gain(steps, explained, one.safe)[0]
         both = [*rest, *parts]
-        if parts and not less and all(_is_left(steps, part, both) for part in both):
+        beside = (counted(steps, part.cause, _without(steps, both, part)) for part in both)
+        if parts and not less and all((part.cells.danger > 0.5).any() for part in beside):  # each has some of its own
             chosen = _pruned(steps, both)
     return chosen
 
@@ -222,11 +223,6 @@ def _about_whom(steps: Steps, causes: Iterable[Cause]) -> Iterator[Cause]:
             yield only_where(cause, held)
 
 
-def _is_left(steps: Steps, one: Counted, chosen: list[Counted]) -> bool:
-    """Whether a cause has danger of its own beside the others."""
-    return bool((counted(steps, one.cause, _without(steps, chosen, one)).cells.danger > 0.5).any())
-
-
 def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
     """Causes of all agents and of some alone, of which nearly all steps that they call unsafe are: those of one entry
     first, then lengths, then all others."""
@@ -249,12 +245,6 @@ def _of_fewer(steps: Steps, one: Counted, explained: Explained) -> Counted:
         if rest and (fewer := counted(steps, narrowed(best.cause, rest), explained)).gain >= best.gain:
             best = fewer
     return best
-
-
-def _purity(steps: Steps, one: Counted) -> float:
-    """Share of the steps that a cause calls unsafe, and that are."""
-    called = one.called.sum()
-    return float((one.called & steps.unsafe).sum() / called) if called else 0.0
 
 
 def _grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
@@ -355,8 +345,11 @@ def _complexity(cause: Cause) -> tuple[int, bool, bool, bool]:
 
 
 def _gain_if(steps: Steps, one: Counted, pure: float) -> float:
-    """What a cause gains; nothing where it is less pure than that."""
-    return 0.0 if pure and _purity(steps, one) < pure else one.gain
+    """What a cause gains; nothing where it is less pure than that: fewer of the steps that it calls unsafe are."""
+    if not pure:
+        return one.gain
+    called = one.called.sum()
+    return one.gain if called and (one.called & steps.unsafe).sum() / called >= pure else 0.0
 
 
 def _best_wider(steps: Steps, best: Counted, explained: Explained, names: Sequence[str]) -> Counted | None:

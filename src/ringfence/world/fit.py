@@ -83,13 +83,6 @@ class Fit:
     cached: bool
     bar: Parts
 
-    @property
-    def formula(self) -> dict[str, Any] | None:
-        """The hazard that labels states."""
-        if self.hazard is None or self.settings.labels != "formula":
-            return None
-        return constraints.to_dict(self.hazard.hazard)
-
     def kept(self) -> World | None:
         """The World in the cache; None where there is none, a damaged one, or one of other data, settings or seed,
         which somebody has put there."""
@@ -122,11 +115,11 @@ class Fit:
     def file(self, name: str, content: list[Any], of: Sequence[str] | None = None) -> Path:
         """Where what depends on `content` and on the settings is kept: on those of the parts `of`, or on all."""
         settings = dataclasses.asdict(self.settings)
-        formula = self.formula
+        by_formula = self.settings.labels == "formula" and (of is None or "label" in of)
+        formula = constraints.to_dict(self.hazard.hazard) if self.hazard is not None and by_formula else None
         if of is not None:
             read = {"view", "execution", *(field for part in of for field in PARTS[part])}
             settings = {field: value for field, value in settings.items() if field in read}
-            formula = formula if {"label", "future"} & set(of) else None
         about = [FORMAT, name, content, settings, self.seed, formula]
         written = msgspec.json.encode(about, enc_hook=np.ndarray.tolist, order="deterministic")
         code = hashlib.sha256(written).hexdigest()[:16]
@@ -396,10 +389,10 @@ class _Danger:
 
     def with_future(self, label: cbf.Barrier, found: Found) -> cbf.Barrier:
         """V beside ℓ."""
-        steps = self.logged.fitted_steps
-        close = steps[self.logged.close_to_danger()[steps]]
 
         def fit(key: Key) -> cbf.Barrier:
+            steps = self.logged.fitted_steps
+            close = steps[self.logged.close_to_danger()[steps]]
             return cbf.fit_future(label, self.logged.arrays, steps, close, key, self.of.settings)
 
         return self.of.part("future", self._content(found), self._blank(found), fit)

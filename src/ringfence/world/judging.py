@@ -104,7 +104,7 @@ def judged(world: World, logged: Logged, whole: Logged, judging: Judging) -> Wor
         scores, _ = of_barrier.scores(barrier, logged, 1.0)
     elif barrier is not None:
         barrier, scores = of_barrier.calibrated(barrier, logged)
-    read = foresight(world.dynamics, barrier, logged, np.random.default_rng(1), judging)
+    read = () if barrier is None else _foresight(world.dynamics, barrier, logged, judging)
     card = replace(
         world.card,
         held_out=HeldOut(episodes=int(whole.held_out.sum()), steps=len(whole.held_steps)),
@@ -180,19 +180,15 @@ def _threshold(dynamics: Dynamics, logged: Logged, count: int) -> Threshold:
 # --- predictions of what a barrier reads ---
 
 
-def foresight(
-    dynamics: Dynamics,
-    barrier: Barrier | MinBarrier | None,
-    logged: Logged,
-    rng: np.random.Generator,
-    judging: Judging,
+def _foresight(
+    dynamics: Dynamics, barrier: Barrier | MinBarrier, logged: Logged, judging: Judging
 ) -> tuple[Foresight, ...]:
     """How well everything that a barrier reads is predicted, in its own unit, beside everything going on as it did: in
     held-out windows, along the logged actions."""
     steps, starts = _windows(logged, judging)
-    if not steps or barrier is None:
+    if not steps:
         return ()
-    starts = rng.choice(starts, min(judging.read, len(starts)), replace=False)
+    starts = np.random.default_rng(1).choice(starts, min(judging.read, len(starts)), replace=False)
     row = logged.picked("row", starts)
     index = np.array(steps)
     now = logged.picked("features", row)

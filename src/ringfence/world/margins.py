@@ -181,7 +181,10 @@ def in_own_margins(
     for k, net in enumerate(nets):
         explained = by_each[:, k] < least_margin(net)  # no margin foresees the rest
         ends = bad[(blamed == k) & explained]
-        found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, stayed))
+        if len(ends):
+            predicted = scores_of_ends(lambda _, after, net=net: _least(net, after), dynamics, logged, ends)
+            net = with_margin(net, max(_own_margin(predicted, np.asarray(_least(net, stayed))), least_margin(net)))
+        found.append(net)
     return tuple(found)
 
 
@@ -189,11 +192,6 @@ def in_own_margins(
 def _least(net: Score, x: Array) -> Array:
     """(W,) the score of the agent in most danger by one cause."""
     return lowest(worst([net], x))
-
-
-def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: np.ndarray) -> Score:
-    predicted = scores_of_ends(lambda _, after: _least(net, after), dynamics, logged, ends)
-    return with_margin(net, max(_own_margin(predicted, np.asarray(_least(net, safe))), least_margin(net)))
 
 
 def _own_margin(predicted: np.ndarray, safe: np.ndarray) -> float:

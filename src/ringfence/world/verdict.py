@@ -185,15 +185,11 @@ def look_of(card: Card) -> Look:
 def _rows_foreseen_well(card: Card) -> int:
     """Rows, FARTHEST at most, for which all that the barrier reads is predicted well; margins widen along them."""
     read = () if card.prediction_error is None else card.prediction_error.read
-    if not read or card.barrier is None or not _widens(card, card.barrier):
+    scores = [] if card.barrier is None else (card.constraints or {"": card.barrier}).values()
+    if not read or not scores or not all(one.widening for one in scores):  # those of before say nothing of rows ahead
         return 0
     well = [all(one.error[at] <= BEARABLE * one.deviation for one in read) for at in range(len(read[0].steps_ahead))]
     return min(max((k for k, told in zip(read[0].steps_ahead, well) if told), default=0), FARTHEST)
-
-
-def _widens(card: Card, scores: BarrierScores) -> bool:
-    """Whether the World says what rows ahead ask for; those of before do not."""
-    return all(one.widening for one in (card.constraints or {"": scores}).values())
 
 
 def _too_late(avoidable: Avoidable) -> bool:
