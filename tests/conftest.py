@@ -42,12 +42,13 @@ from ringfence.datasets.behaviour import collect
 from ringfence.envs import SimpleSpread
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.world import judging
 from tests import quick
 
 # What judges a World, and not what it is made of, takes a third of a small fit: whether actions could have avoided
 # danger, what a guard's search would call safe, what rows far ahead ask for. Worlds of tests are judged where
 # `@pytest.mark.judged` says so, of fewer entries and by a search that never begins again.
-quick.judge_little()
+judging.JUDGING = quick.LITTLE
 
 # Tracing makes many objects that stay; looking through them for garbage as often as usual takes a tenth of the time.
 gc.set_threshold(50_000, 20, 20)
@@ -135,7 +136,7 @@ def insist(request, monkeypatch):
     """Worlds of tests are fitted in a second and unfit to guard by, so guards insist on them; but where a test is of
     verdicts (`@pytest.mark.verdicts`)."""
     if request.node.get_closest_marker("judged") is not None:
-        quick.judge_in_full(monkeypatch)
+        monkeypatch.setattr(judging, "JUDGING", quick.IN_FULL)
     if request.node.get_closest_marker("verdicts") is None:
         for name in ("require", "require_values"):
             monkeypatch.setattr(f"ringfence.guards.policy.{name}", lambda card, anyway=False: None)

@@ -1,13 +1,10 @@
 """What several test files ask for by name."""
 
-import dataclasses
 import functools
 
 import jax
-import pytest
 
-from ringfence.guards import searched
-from ringfence.world import margins, validate
+from ringfence.world.judging import Judging
 
 # A World that is fitted in a second and knows little.
 QUICK_WORLD = dict(
@@ -20,27 +17,10 @@ QUICK_WORLD = dict(
     future_updates=20,
 )
 
-# What judges a World, and what stands for it in tests.
-_LITTLE = {
-    (searched, "false_safe"): lambda *_: None,
-    (validate, "_avoidable"): lambda *_: None,
-    (margins, "AHEAD"): margins.AHEAD[:1],
-}
-_IN_FULL = {place: getattr(*place) for place in _LITTLE}
-
-
-def judge_little() -> None:
-    """Worlds that are fitted from now on are hardly judged; where they are, of few entries and by a short search."""
-    validate.ENTERED = 20
-    searched.SHIELD = dataclasses.replace(searched.SHIELD, correction_restarts=0)
-    for place, little in _LITTLE.items():
-        setattr(*place, little)
-
-
-def judge_in_full(patch: pytest.MonkeyPatch) -> None:
-    """Worlds are judged by all that judges them, until the patch ends."""
-    for place, whole in _IN_FULL.items():
-        patch.setattr(*place, whole)
+# How Worlds of tests are judged: hardly, or by all that judges them, of fewer entries and by a search that never begins
+# again.
+LITTLE = Judging(avoided=0, searched=0, widened=(5,))
+IN_FULL = Judging(avoided=20, restarts=0)
 
 
 def in_one_program(function, *arguments):

@@ -24,7 +24,7 @@ from ringfence.world import (
     cause_counts,
     cause_search,
     causes,
-    foresight,
+    judging,
     load,
     margins,
     probes,
@@ -41,13 +41,12 @@ from ringfence.world.card import (
     ValueScores,
     Verdict,
 )
-from ringfence.world.cause_nets import FAR, LEAST, blank, scores, values_of, with_margin
-from ringfence.world.causes import Cause, Edge, Found
+from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
+from ringfence.world.causes import SLOPED, Cause, Edge, Found
 from ringfence.world.cells import Cells
-from ringfence.world.heading import Heading
+from ringfence.world.dynamics import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
-from ringfence.world.look import look_of
-from tests.quick import QUICK_WORLD, judge_in_full
+from tests.quick import IN_FULL, QUICK_WORLD
 
 N, STEPS = 3, 40
 NAMES = ["own.x", "own.y", "own.v", "goal.dx", "goal.dy"] + [f"other{j}.d{c}" for j in range(N - 1) for c in "xy"]
@@ -131,7 +130,7 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     assert edge.below and abs(edge.at - 3.0) < 0.05 and abs(edge.at / cause.ratio - 0.5) < 0.01
     assert found.explained > 0.9 and found.false_alarms < 0.01
     x = others[:50].reshape(50, N, -1)
-    np.testing.assert_allclose(cause.of(x), values_of(cause, jnp.asarray(x)), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(cause.of(x), cause.of(jnp.asarray(x), SLOPED), rtol=1e-4, atol=1e-4)
     loaded = msgspec.json.decode(msgspec.json.encode(found), type=Found)
     assert loaded == found
 
@@ -190,9 +189,9 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     elif what != "strip":  # what is in one number has two edges
         near, second = {"fast": (5.0, 3.0), "head-on": (12.0, 3.0)}.get(what, (8.0, np.arccos(0.7)))
         assert abs(at - near) < 0.1 and abs(found.causes[0].second_edge(at) - second) < 0.05
-    np.testing.assert_allclose(found.causes[0].of(x), values_of(found.causes[0], jnp.asarray(x)), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(found.causes[0].of(x), found.causes[0].of(jnp.asarray(x), SLOPED), rtol=1e-3, atol=1e-3)
     here = jnp.zeros((N, x.shape[-1]))
-    assert np.isfinite(jax.grad(lambda x: values_of(found.causes[0], x).sum())(here)).all()
+    assert np.isfinite(jax.grad(lambda x: found.causes[0].of(x, SLOPED).sum())(here)).all()
 
 
 def test_what_has_room_for_one_is_dangerous_for_two():
@@ -206,7 +205,7 @@ def test_what_has_room_for_one_is_dangerous_for_two():
     assert cause.name == "other.place, own.place"
     assert found.explained > 0.9 and found.false_alarms < 0.1
     np.testing.assert_allclose(cause.of(x)[:, 0, 0], place[:, :2].reshape(30_000, 4), atol=1e-5)
-    np.testing.assert_allclose(values_of(cause, jnp.asarray(x)), cause.of(x), atol=1e-5)
+    np.testing.assert_allclose(cause.of(jnp.asarray(x), SLOPED), cause.of(x), atol=1e-5)
 
 
 def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
@@ -218,7 +217,7 @@ def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
     x = np.random.default_rng(0).normal(0, 2, (50, 1, 3)).astype(np.float32)
     looks = np.concatenate([x[..., :2], np.cos(x[..., 2:]), np.sin(x[..., 2:])], -1)
     np.testing.assert_allclose(ahead.of(looks), angle.of(x), atol=1e-5)
-    np.testing.assert_allclose(values_of(angle, jnp.asarray(x)), angle.of(x), atol=1e-5)
+    np.testing.assert_allclose(angle.of(jnp.asarray(x), SLOPED), angle.of(x), atol=1e-5)
 
 
 def test_danger_that_nothing_tells_has_no_cause(logged):
@@ -418,7 +417,7 @@ def store_of(episodes=200, unsafe=None, **card):
 @pytest.fixture(scope="module")
 def fitted():
     with pytest.MonkeyPatch.context() as patch:
-        judge_in_full(patch)
+        patch.setattr(judging, "JUDGING", IN_FULL)
         return fit(store_of(), **QUICK, barrier_updates=1500)
 
 
@@ -688,7 +687,7 @@ def test_a_guards_search_finds_no_danger_in_a_good_barrier_and_some_in_a_bad_one
     assert "other" not in blind.causes[0].cause.name
     map = fitted.map
     logged = Logged.of(store, map, held_out(store, 0), labels_of(store, map, fitted.card.settings, None))
-    assert searched.false_safe(dataclasses.replace(fitted, barrier=blind), logged) > 0.02
+    assert searched.false_safe(dataclasses.replace(fitted, barrier=blind), logged, IN_FULL) > 0.02
 
 
 def test_entries_that_a_cause_does_not_explain_leave_its_margin(fitted):
@@ -722,7 +721,7 @@ def test_margins_widen_by_what_rows_ahead_are_predicted_worse(fitted):
             return after.at[..., 5:].multiply(1.05), spread
 
     def of(dynamics):
-        found = margins.widening(fitted.barrier, dynamics, logged, np.random.default_rng(2))
+        found = margins.widening(fitted.barrier, dynamics, logged, np.random.default_rng(2), IN_FULL.widened, 1000)
         return dict(zip((net.cause.name for net in fitted.barrier.causes), found))
 
     pair = "length of other.dx, other.dy"
@@ -781,11 +780,11 @@ def test_foresight_reads_the_thing_in_most_danger():
     x = np.array([3.0, 0.0, 0.0, 4.0]).reshape(1, 1, 1, 4)
     (cause,) = cause_candidates.offsets([f"other{j}.d{c}" for j in range(2) for c in "xy"])
     near, far = Edge((0.0,), (9.0,), at=1.0), Edge((0.0,), (9.0,), at=1.0, below=False)
-    assert foresight._read(x, cause, near) == foresight._read(x[..., [2, 3, 0, 1]], cause, near) == 3.0
-    assert foresight._read(x, cause, far) == 4.0
-    assert foresight._read(x, causes.narrowed(cause, ((0, 1),)), near) == 4.0
-    place = foresight._read(x, Cause("own.x, own.y", ((0, 3),)), None)
-    assert place.shape == (1, 1, 2) and foresight._rms(place) == (5.0,)
+    assert judging._read(x, cause, near) == judging._read(x[..., [2, 3, 0, 1]], cause, near) == 3.0
+    assert judging._read(x, cause, far) == 4.0
+    assert judging._read(x, causes.narrowed(cause, ((0, 1),)), near) == 4.0
+    place = judging._read(x, Cause("own.x, own.y", ((0, 3),)), None)
+    assert place.shape == (1, 1, 2) and judging._lengths(place) == (5.0,)
 
 
 def test_constant_velocity_is_that_of_the_names():
@@ -795,8 +794,8 @@ def test_constant_velocity_is_that_of_the_names():
     map = FeatureMap("pruned", names, "observations", table, -np.ones_like(table), turns=(Turn(3, -np.pi, 2 * np.pi),))
     before, now = np.array([[[0.0, 5.0, 1.0, 3.0]]]), np.array([[[1.0, -3.0, 2.0, -3.0]]])
     turned = 2 * np.pi - 6.0
-    np.testing.assert_allclose(foresight._moved(map, now, before, 0.5), [[[1.0, 1.0, 1.0, turned]]])
-    np.testing.assert_allclose(foresight._moved(map, now, before, None), [[[1.0, -8.0, 1.0, turned]]])
+    np.testing.assert_allclose(judging._moved(map, now, before, 0.5), [[[1.0, 1.0, 1.0, turned]]])
+    np.testing.assert_allclose(judging._moved(map, now, before, None), [[[1.0, -8.0, 1.0, turned]]])
 
 
 def test_foresight_is_told_in_seconds_where_logs_say_how_long_a_step_is():
@@ -847,7 +846,7 @@ def test_a_guard_looks_as_far_as_the_card_asks(fitted):
     from ringfence.guards.policy import by_card
 
     def asked(card):
-        card = msgspec.structs.replace(card, look=look_of(card))
+        card = msgspec.structs.replace(card, look=verdict.look_of(card))
         return by_card(dataclasses.replace(fitted, card=card), "shield", {})
 
     def seen(rows, avoided, error):

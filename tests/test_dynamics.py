@@ -9,6 +9,7 @@ import pytest
 
 from ringfence.problem.features import FeatureMap
 from ringfence.world.dynamics import blank_dynamics, fit_dynamics
+from ringfence.world.settings import Settings
 
 EPISODES, STEPS, AGENTS = 40, 50, 2
 
@@ -43,8 +44,8 @@ def test_it_learns_what_actions_do(joint):
     features, actions, row = log(joint)
     if joint:
         features = jnp.concatenate([features, features[:, ::-1]], -1)
-    sizes = dict(num_ensemble=2, updates=1500, width=16)
-    dynamics = fit_dynamics(features, actions, row, view(joint), jax.random.key(0), **sizes)
+    settings = Settings(num_ensemble=2, dynamics_updates=1500, dynamics_width=16)
+    dynamics = fit_dynamics(features, actions, row, view(joint), jax.random.key(0), settings)
     foreseen, spread = dynamics.step(features[row], actions)
     error, moved = foreseen - features[row + 1], features[row + 1] - features[row]
     assert jnp.sqrt((error**2).mean()) < 0.05 * jnp.sqrt((moved**2).mean())
@@ -78,8 +79,8 @@ def test_who_guesses_what_others_see_does_not_take_its_own_action_for_the_cause(
     map = FeatureMap("decentralized", ("seen",), "observations", table, np.full_like(table, -1))
     map = replace(map, models_others=models_others)
     row = jnp.arange(len(wind) - 1)
-    sizes = dict(num_ensemble=2, updates=1500, width=16)
-    dynamics = fit_dynamics(features, actions[:-1], row, map, jax.random.key(0), **sizes)
+    settings = Settings(num_ensemble=2, dynamics_updates=1500, dynamics_width=16)
+    dynamics = fit_dynamics(features, actions[:-1], row, map, jax.random.key(0), settings)
     pushed, pulled = (dynamics.step(features[:-1], actions[:-1].at[:, 0].set(a))[0][:, 0] for a in (1.0, -1.0))
     effect = jnp.abs(pushed - pulled).mean() / (2 / 20)  # of what the wind does
     assert effect < 0.2 if models_others else effect > 0.5

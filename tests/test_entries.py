@@ -14,7 +14,7 @@ from ringfence.problem.features import FeatureMap, constant_velocity, derived, f
 from ringfence.problem.names import Names
 from ringfence.world import cause_candidates
 from ringfence.world.barrier import shape_of
-from ringfence.world.heading import Heading
+from ringfence.world.dynamics import Heading
 
 FIELDS = ("d{0}", "d{1}", "dv{0}", "dv{1}")
 OWN = ("{0}", "{1}", "v{0}", "v{1}")

@@ -26,7 +26,7 @@ from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
 from ringfence.world.card import Avoidable, BarrierScores, Card, Verdict
-from ringfence.world.look import look_of
+from ringfence.world.verdict import look_of
 from tests.quick import QUICK_WORLD
 
 

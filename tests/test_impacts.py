@@ -18,9 +18,8 @@ from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import features
 from ringfence.world import impacts, probes
-from ringfence.world.card import UNKNOWN
+from ringfence.world.card import UNKNOWN, Settings
 from ringfence.world.logged import Logged, held_out, labels_of
-from ringfence.world.settings import Settings
 
 WALL = 1.0
 DT = 0.1

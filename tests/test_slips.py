@@ -61,7 +61,7 @@ def test_what_a_world_would_not_know_is_told_before_it_is_fitted(monkeypatch):
     def stop(*_, **__):
         raise Begun
 
-    monkeypatch.setattr(worlds, "fit_view", stop)
+    monkeypatch.setattr(worlds, "Fit", stop)
     unnamed = [f"o{k}" for k in range(8)]
     for store, said in (
         (logs([n.replace("other0.dx", "othr0.dx") for n in NAMES]), "look like one kind of entry"),

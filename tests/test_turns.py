@@ -13,8 +13,9 @@ from ringfence.problem import features, partners, turns
 from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.turns import Turn
 from ringfence.training import worlds
-from ringfence.world import storage
+from ringfence.world import model
 from ringfence.world.dynamics import fit_dynamics
+from ringfence.world.settings import Settings
 from tests.quick import QUICK_WORLD
 
 WHOLE = 2 * np.pi
@@ -78,9 +79,7 @@ def test_a_world_predicts_past_the_end_of_a_turn():
         row,
         map,
         jax.random.key(0),
-        num_ensemble=2,
-        updates=600,
-        width=32,
+        Settings(num_ensemble=2, dynamics_updates=600, dynamics_width=32),
     )
     x, errors = jnp.asarray(seen[:, 0]), []
     for k in range(1, 20):
@@ -174,9 +173,9 @@ def test_a_world_reads_who_is_seen_only_where_that_tells_more(tmp_path, monkeypa
     errors = [world.card.prediction_error.error_of_change[0] for world in (told, plain)]
     assert errors[0] < 0.95 * errors[1], errors
     assert "Who is in lists of the nearest is found" in str(told.card)
-    kept = storage.load(storage.save(told, tmp_path / "told.world"))
+    kept = model.load(model.save(told, tmp_path / "told.world"))
     assert kept.dynamics.map.mirrored and kept.map == told.map
-    assert not storage.load(storage.save(plain, tmp_path / "plain.world")).dynamics.map.mirrored
+    assert not model.load(model.save(plain, tmp_path / "plain.world")).dynamics.map.mirrored
 
 
 def test_lists_that_nobody_named_are_named():

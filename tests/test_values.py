@@ -9,7 +9,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData
 from ringfence.problem.constraints import Separation
 from ringfence.proposals import conditions
-from ringfence.world import values
+from ringfence.world import Settings, values
 
 
 def test_advantages_match_their_definition():
@@ -101,7 +101,7 @@ def test_what_ended_for_good_is_worth_nothing(played, monkeypatch):
     monkeypatch.setattr(values, "fit_critic", fit_critic)
     arrays = WindowData(store, view).arrays | {"returns_to_go": jnp.ones(store.steps)}
     picked = jnp.arange(25, store.steps)  # the first fall is held out
-    values.fit_values(arrays, picked, view, jax.random.key(0), discount=0.9, updates=1, period=26)
+    values.fit_values(arrays, picked, view, jax.random.key(0), Settings(value_updates=1), period=26)
     assert len(seen["x"]) == len(seen["returns"]) == len(picked) + 2
     np.testing.assert_array_equal(seen["returns"][-3:], [1, 0, 0])
     np.testing.assert_array_equal(seen["x"][-2:], arrays["features"][jnp.asarray([51, 77])])

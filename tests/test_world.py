@@ -21,9 +21,9 @@ from ringfence.loading import run_worlds
 from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
+from ringfence.world import Settings, judging, margins
 from ringfence.world import barrier as cbf
-from ringfence.world import margins, validate
-from tests.quick import QUICK_WORLD
+from tests.quick import IN_FULL, LITTLE, QUICK_WORLD
 
 
 def with_costs(store, costs, task="mine"):
@@ -100,6 +100,16 @@ def test_a_cache_that_takes_no_world_is_said(small_store, monkeypatch, tmp_path)
     assert not list(tmp_path.rglob("*.safetensors")) and not list(tmp_path.rglob("*.part"))
 
 
+def test_what_judges_a_world_is_set_and_kept_apart(small_store, small_world, monkeypatch):
+    """Of the same parts: a card says what was asked."""
+    monkeypatch.setattr(judging, "JUDGING", dataclasses.replace(LITTLE, ahead=2))
+    again = worlds.fit(small_store, **QUICK_WORLD)
+    assert again.card.prediction_error.steps_ahead == (1, 2)
+    assert small_world.card.prediction_error.steps_ahead == tuple(range(1, LITTLE.ahead + 1))
+    assert eqx.tree_equal(again.dynamics.net, small_world.dynamics.net)
+    assert again.card.barrier.avoidable is None and np.isnan(again.card.barrier.searched), "none is asked about"
+
+
 def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):
     """A guard of either is the same program: static fields are compared by content."""
     file = world.save(small_world, tmp_path / "w.safetensors")
@@ -131,7 +141,6 @@ class Head(eqx.Module):
         return after[..., 0]
 
 
-@pytest.mark.judged
 def test_the_card_says_how_far_ahead_danger_is_decided():
     """Cars that close in at 1 m/s stop in half a metre: from five steps before it is too late, from seven it is not."""
     gap = 1.93 - 0.1 * np.arange(21)
@@ -139,8 +148,8 @@ def test_the_card_says_how_far_ahead_danger_is_decided():
     arrays = {"features": jnp.asarray(x, jnp.float32), "actions": jnp.zeros((20, 2, 1))}
     arrays |= {"row": np.arange(20), "first_row": np.zeros(20, int), "last_row": np.full(20, 20)}
     entered = np.array([19])  # the step that ends with a gap below 0
-    found = validate._avoidable(Head(), Head(), arrays, entered)
-    assert found.before == validate.BEFORE[:-1] and found.rows == 7  # the log is 20 steps long
+    found = judging._avoidable(Head(), Head(), arrays, entered, IN_FULL)
+    assert found.before == IN_FULL.before[:-1] and found.rows == 7  # the log is 20 steps long
     assert found.avoided == (0, 0, 0, 0, 1, 1, 1, 1)
 
 
@@ -199,11 +208,11 @@ def test_the_worst_agent_explains_the_teams_cost():
     map = FeatureMap("pruned", names, "observations", table, table * 0 - 1)
     near = np.linalg.norm(gap, axis=-1).min(-1) < 0.3  # (M, N)
     unsafe = near.any(-1)[1:]
-    blank = cbf.blank_barrier(map, 32)
+    settings = Settings(barrier_updates=800, barrier_width=32)
+    blank = cbf.blank_barrier(map, settings)
     data = jnp.asarray(x), jnp.asarray(x[1:]), jnp.arange(len(x) - 1), jnp.asarray(unsafe)
     steps = np.arange(len(x) - 1)
-    settings = dict(loss="cross-entropy", updates=800, width=32)
-    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), **settings)
+    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), settings)
     h = np.asarray(fitted.of_steps(jnp.asarray(x), jnp.asarray(x)))
     assert ((h < 0) == near).mean() > 0.95  # each agent's own danger, though no label named it
     assert np.abs(h).max() <= cbf.FARTHEST
@@ -219,16 +228,16 @@ def test_danger_is_seen_ahead():
     row = (np.arange(episodes)[:, None] * (steps + 1) + np.arange(steps)).ravel()
     unsafe = rows[row + 1, 0, 0] > 0.8
     table = np.zeros((1, 2), int)
-    blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), 32)
-    settings = dict(loss="cross-entropy", updates=500, width=32)
+    settings = Settings(barrier_updates=500, barrier_width=32, future_discount=0.9, expectile=0.9, future_updates=1)
+    blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), settings)
     data = jnp.asarray(rows), jnp.asarray(rows[row + 1]), jnp.asarray(row), jnp.asarray(unsafe)
     every = np.arange(len(row))
-    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **settings)
+    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), settings)
     arrays = {"features": data[0], "row": data[2], "terminated": jnp.zeros(len(row), bool)}
-    settings = dict(discount=0.9, expectile=0.9)
-    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), updates=1, **settings)
+    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), settings)
     np.testing.assert_allclose(start.ahead(data[0]), fitted.of_steps(data[0], data[0]), atol=1.0)  # it begins as ℓ
-    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), updates=1000, **settings)
+    settings = dataclasses.replace(settings, future_updates=1000)
+    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), settings)
     doomed, fine = jnp.asarray([[[0.4, 0.9]]]), jnp.asarray([[[0.4, -0.9]]])
     assert fitted.of_steps(doomed, doomed) > 0 and fitted.of_steps(fine, fine) > 0
     assert ahead.ahead(doomed) < 0 < ahead.ahead(fine)

@@ -3,8 +3,6 @@ the pockets in which the World is wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -17,41 +15,42 @@ from ringfence.proposals.base import held
 from ringfence.types import Array
 from ringfence.utils.device import on_device
 from ringfence.world import World, cause_candidates
+from ringfence.world.card import UNKNOWN
 from ringfence.world.cause_counts import Explained, counted, some_steps
 from ringfence.world.causes import Cause
 from ringfence.world.cells import Cells
+from ringfence.world.judging import Judging
 from ringfence.world.logged import Logged
 
-STATES = 128  # held-out safe states from which actions are searched
 FEW = 10  # safe steps of what was found, with fewer of which nothing is said
 SURE = 0.8  # probability that being in a cell makes a step unsafe, from which on what was found there counts as wrong
-SHIELD = GuardOptions(correction_steps=10, correction_restarts=1, margin=1.0)
 
 
-def false_safe(world: World, logged: Logged) -> float | None:
+def false_safe(world: World, logged: Logged, judging: Judging) -> float:
     """The share of predicted steps that a shield's search calls safe, and that the logs call dangerous: somebody is in
-    a place, or as near to something, as hardly any safe step was. None where names tell no places."""
-    known = [] if world.barrier is None else _known(logged)
+    a place, or as near to something, as hardly any safe step was. UNKNOWN where names tell no places."""
+    known = [] if world.barrier is None or not judging.searched else _known(logged)
     if not known:
-        return None
+        return UNKNOWN
     rng = np.random.default_rng(3)
     steps = logged.held_steps
     safe = steps[~logged.unsafe[steps]]
     close = np.intersect1d(safe, np.flatnonzero(logged.close_to_danger()))
-    picked = [rng.choice(these, min(STATES // 2, len(these)), replace=False) for these in (close, safe)]
+    picked = [rng.choice(these, min(judging.searched // 2, len(these)), replace=False) for these in (close, safe)]
     begun = np.concatenate(picked)
     if len(begun) < FEW:
-        return None
+        return UNKNOWN
     present = logged.before(begun)
     agents, entries = logged.arrays["actions"].shape[1:]
     wanted = rng.choice((-1.0, 0.0, 1.0), (len(present), agents, entries)).astype(np.float32)
-    guard = Guard(BarrierSource(world, "learned", None, False), SHIELD)
+    options = GuardOptions(correction_steps=judging.corrections, correction_restarts=judging.restarts, margin=1.0)
+    guard = Guard(BarrierSource(world, "learned", None, False), options)
     rows, met = _searched(guard, on_device(present), on_device(wanted))
     found = np.asarray(rows)[np.asarray(met)]  # (found, K, N, D)
     if len(found) < FEW:
-        return None
+        return UNKNOWN
     wrong = np.logical_or.reduce([_dangerous(one, found) for one in known])
-    return float(wrong.mean())
+    return round(float(wrong.mean()), 4)
 
 
 @eqx.filter_jit
@@ -72,8 +71,10 @@ def _searched(guard: Guard, present: Array, wanted: Array) -> tuple[Array, Array
 
 def _known(logged: Logged) -> list[Cells]:
     """Where the logs have danger: one's own place, and how far things are, as names tell, counted cell by cell."""
-    names = logged.map.names
-    simple = [*_own_place(names), *cause_candidates.offsets(names)]
+    names = list(logged.map.names)
+    simple = cause_candidates.offsets(names)
+    if {"own.x", "own.y"} <= set(names):
+        simple.insert(0, Cause("own.x, own.y", ((names.index("own.x"), names.index("own.y")),)))
     if not simple:
         return []
     steps = np.arange(logged.store.steps)
@@ -81,12 +82,6 @@ def _known(logged: Logged) -> list[Cells]:
     counts = some_steps(x, logged.label, logged.store.episode_of_step, np.random.default_rng(0))
     nothing = Explained.by(counts, [])
     return [counted(counts, cause, nothing).cells for cause in simple]
-
-
-def _own_place(names: Sequence[str]) -> list[Cause]:
-    if not {"own.x", "own.y"} <= set(names):
-        return []
-    return [Cause("own.x, own.y", (tuple(list(names).index(name) for name in ("own.x", "own.y")),))]
 
 
 def _dangerous(cells: Cells, x: np.ndarray) -> np.ndarray:

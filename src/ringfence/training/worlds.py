@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
 from ringfence.datasets import registry
 from ringfence.datasets.audit import odd_danger, odd_names
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, whole_number
-from ringfence.guards import searched
+from ringfence.guards.searched import false_safe
 from ringfence.logs.resolution import require_resolved
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
@@ -19,9 +23,10 @@ from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import build_config
 from ringfence.utils.precision import in_float32
 from ringfence.utils.progress import Parts
-from ringfence.world import Settings, World
+from ringfence.world import Settings, World, judging
 from ringfence.world import load as load_world
-from ringfence.world.fit import expected, fit_view
+from ringfence.world.fit import Fit, expected, fitted
+from ringfence.world.verdict import decided
 
 WORLD = "world.safetensors"  # in a run folder: the World that training read
 GUARD = "guard.safetensors"  # and the one that guards, where that is kept there and is another
@@ -98,8 +103,26 @@ def fit(
             spec = task.spec(map, store)
             bind = constraints.bind if needed else constraints.bind_or_none
             hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
-        how = {"hazard": hazard, "seed": seed, "cached": cached, "bar": bar}
-        return fit_view(store, map, spec, settings, **how, search=searched.false_safe)
+        of = Fit(store, map, spec, settings, hazard, seed, cached, bar)
+        if (kept := of.kept()) is not None:
+            return kept
+        return of.keep(_judged(of))
+
+
+def _judged(of: Fit) -> World:
+    """The World, fitted, with a card that says how good it is: by itself, and by what a guard finds in it."""
+    begun = time.perf_counter()
+    world, logged, whole = fitted(of)
+    with of.bar.part("card"):
+        world = judging.judged(world, logged, whole, judging.JUDGING)
+    card = world.card
+    with of.bar.part("search"):
+        if card.barrier is not None:
+            searched = false_safe(world, logged, judging.JUDGING)
+            card = replace(card, barrier=replace(card.barrier, searched=searched))
+    seconds = of.bar.seconds | {"in all": time.perf_counter() - begun}
+    card = replace(card, seconds={name: round(took, 1) for name, took in seconds.items()})
+    return dataclasses.replace(world, card=decided(card))
 
 
 @in_float32

@@ -4,8 +4,7 @@ dangerous. One pytree, one file, one card that says how good each part is on hel
 from __future__ import annotations
 
 from ringfence.world.card import Card
-from ringfence.world.model import World
+from ringfence.world.model import World, load, save
 from ringfence.world.settings import Settings
-from ringfence.world.storage import load, save
 
 __all__ = ["Card", "Settings", "World", "load", "save"]

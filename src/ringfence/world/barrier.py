@@ -35,13 +35,15 @@ from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.cause_nets import Score, blank, scores, worst
+from ringfence.world.cause_nets import Labelled, Score, blank, scores, worst
 from ringfence.world.causes import Found
+from ringfence.world.settings import Settings
 
 Widening = tuple[float, ...]  # by row ahead, in margins
-Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]
 DANGEROUS = ("other", "obstacle", "wall")  # kinds of things that names may tell of, each with a pair network of its own
 FARTHEST = 15.0  # scores end softly there: log-odds that no data can tell apart
+BATCH = 512  # steps
+RATE = 0.02  # at which the slow copy of V follows
 UNSURE = 5.0  # score that g_0 begins with, so that pairs explain danger first
 
 
@@ -70,6 +72,11 @@ class Barrier(eqx.Module):
     unit: Array  # () the margin that calibration asks for
     shape: Shape
     causes: tuple[Score, ...] = ()  # ℓ by causes, where they were found; `label` is empty then
+
+    @property
+    def each(self) -> tuple[Barrier, ...]:
+        """Itself, as of the one constraint."""
+        return (self,)
 
     def of_steps(self, before: Array, after: Array) -> Array:
         """ℓ (..., N) of steps from features (..., N, D) to others."""
@@ -331,36 +338,25 @@ def _with_distance(pair: Array, place: tuple[int, ...], speed: tuple[int, ...]) 
 
 
 def fit_label(
-    barrier: Barrier,
-    data: tuple[Array, Array, Array, Array],
-    unsafe: np.ndarray,
-    safe: np.ndarray,
-    key: Key,
-    *,
-    loss: Loss,
-    penalty: float = 1.0,
-    share: float = 0.5,
-    updates: int,
-    width: int,
-    batch: int = 512,
+    barrier: Barrier, data: Labelled, unsafe: np.ndarray, safe: np.ndarray, key: Key, settings: Settings
 ) -> Barrier:
-    """ℓ fitted to labels. data: features (M, N, D), predicted (T, N, D), row (T,), label (T,) or (T, N) bool of steps;
-    `unsafe` and `safe` index the steps to learn from. A quarter of every batch is unsafe.
+    """ℓ fitted to labels; `unsafe` and `safe` index the steps to learn from. A quarter of every batch is unsafe.
 
-    A `share` of the steps ends where it was *predicted* to end: that is what a barrier is asked about. Learned from
-    what came to be alone, it may take the rebound after a contact for the contact, which no model predicts.
+    A `predicted_share` of the steps ends where it was *predicted* to end: that is what a barrier is asked about.
+    Learned from what came to be alone, it may take the rebound after a contact for the contact, which none predicts.
 
     Hinges are the paper's with a margin of 1; `gradient-penalty` adds `penalty` · E(‖∇ℓ(ŝ)‖ − 1)² between the classes.
     """
     key_nets, key_fit = jax.random.split(key)
     shape = barrier.shape
-    few = batch // 4
+    loss, share = settings.loss, settings.predicted_share
+    few = BATCH // 4
 
     def objective(net: dict[str, MLP], data: tuple[Array, ...], pick: Array) -> Array:
         x, predicted, row, label, bad, fine = data
         step = jnp.concatenate([bad[pick[:few] % len(unsafe)], fine[pick[few:] % len(safe)]])
         before = x[row[step]]
-        as_predicted = jnp.floor(jnp.arange(1, batch + 1) * share) > jnp.floor(jnp.arange(batch) * share)
+        as_predicted = jnp.floor(jnp.arange(1, BATCH + 1) * share) > jnp.floor(jnp.arange(BATCH) * share)
         after = jnp.where(as_predicted[:, None, None], predicted[step], x[row[step] + 1])
         z = barrier.standardised(before, after)
         h = _score(net, shape, z, after.shape[:-1])
@@ -373,14 +369,15 @@ def fit_label(
             return optax.sigmoid_binary_cross_entropy(-h, truth.astype(jnp.float32)).mean()
         total = jnp.where(truth, jax.nn.relu(1.0 + h), jax.nn.relu(1.0 - h)).mean()
         if loss == "gradient-penalty":
-            total = total + penalty * _steepness(net, shape, z, few, after[:few].shape[:-1])
+            total = total + settings.penalty * _steepness(net, shape, z, few, after[:few].shape[:-1])
         return total
 
     rows = 2**31 - 1
-    net = networks(key_nets, shape, width)
+    net = networks(key_nets, shape, settings.barrier_width)
     words = "barrier, what is dangerous now"
     given = (*data, on_device(unsafe), on_device(safe))
-    found = regress(objective, net, given, rows, key_fit, updates, batch, 2e-3, words, decay=1e-4)
+    updates = settings.barrier_updates
+    found = regress(objective, net, given, rows, key_fit, updates, BATCH, 2e-3, words, decay=1e-4)
     return eqx.tree_at(lambda b: b.label, barrier, found)
 
 
@@ -393,17 +390,7 @@ def _steepness(net: dict[str, MLP], shape: Shape, z: Array, few: int, agents: tu
 
 
 def fit_future(
-    barrier: Barrier,
-    arrays: dict[str, Array],
-    picked: np.ndarray,
-    close: np.ndarray,
-    key: Key,
-    *,
-    discount: float,
-    expectile: float,
-    updates: int,
-    batch: int = 512,
-    rate: float = 0.02,
+    barrier: Barrier, arrays: dict[str, Array], picked: np.ndarray, close: np.ndarray, key: Key, settings: Settings
 ) -> Barrier:
     """V by in-sample backups y = (1 − γ) ℓ + γ min(ℓ, V̄(s')), y = ℓ where the task ended, with an upper expectile over
     what the logs did, V̄ a slow copy. It begins as ℓ, which it never exceeds; from fresh weights where ℓ reads both ends
@@ -412,7 +399,8 @@ def fit_future(
     """
     key_nets, key_fit = jax.random.split(key)
     shape = _still(barrier.shape)
-    few = batch // 4 if len(close) else 0
+    discount, expectile = settings.future_discount, settings.expectile
+    few = BATCH // 4 if len(close) else 0
     net = barrier.label
     if barrier.causes or barrier.shape.use_transition:
         width = next(iter(barrier.future.values())).weights[0].shape[-1]
@@ -434,25 +422,21 @@ def fit_future(
 
     def following(pair: tuple[dict[str, MLP], dict[str, MLP]]) -> tuple[dict[str, MLP], dict[str, MLP]]:
         net, slow = pair
-        return net, follow(slow, net, rate)
+        return net, follow(slow, net, RATE)
 
     near = on_device(close if len(close) else picked)
     data = arrays["features"], arrays["row"], arrays["terminated"], near, on_device(picked)
     words = "barrier, what will be dangerous"
     pair = net, net
-    found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, batch, 1e-3, words, after=following)
+    updates = settings.future_updates
+    found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, BATCH, 1e-3, words, after=following)
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 
 
-def blank_barrier(
-    map: FeatureMap,
-    width: int,
-    use_transition: bool | None = None,
-    distances: bool = True,
-    found: Found | None = None,
-) -> Barrier:
+def blank_barrier(map: FeatureMap, settings: Settings, found: Found | None = None) -> Barrier:
     """A barrier of the right shapes that says nothing."""
-    shape = shape_of(map, use_transition, distances)
+    width = settings.barrier_width
+    shape = shape_of(map, settings.use_transition, settings.distances)
     one = jnp.ones(len(map.names))
     key = jax.random.key(0)
     return Barrier(

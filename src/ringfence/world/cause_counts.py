@@ -1,4 +1,5 @@
-"""How often steps are unsafe when somebody is in a cell: what the search for causes counts, and what it gains.
+"""How often steps are unsafe when somebody is in a cell: what the search for causes counts, and what it gains; and, of
+a cause of one number, where danger begins, finer than cells are.
 
 Every episode is in one of FOLDS parts. What explains a step is counted on the other parts, so that a cause gains
 nothing by steps that it knows.
@@ -10,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import msgspec
 import numpy as np
 
-from ringfence.world.causes import Cause, narrowed
+from ringfence.world.causes import Cause, Edge, narrowed
 from ringfence.world.cells import CELLS, Cells
 
 UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
@@ -21,6 +23,7 @@ FOLDS = 3
 SUFFICIENT = 0.3  # share of unsafe steps, beyond what others explain, at which a cell is dangerous
 CLEAR = 0.8  # probability of danger of cells whose neighbours may hold an edge
 PRIOR = 2.0  # safe visits that every cell is taken to have had
+AROUND = 3.0  # cells to either side that an edge is looked for in
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,3 +265,81 @@ def _cell(cause: Cause, x: np.ndarray, low: np.ndarray, high: np.ndarray, bins: 
     for k in range(1, cause.width):
         cell = cell * bins + places[..., k]
     return cell
+
+
+# --- edges ---
+
+
+def radius(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, cause: Cause) -> Edge:
+    """Where one cause is dangerous, as steps tell it that look for no other."""
+    steps = some_steps(x, unsafe, episode, np.random.default_rng(0))
+    nothing = Explained.by(steps, [])
+    return refined(steps, counted(steps, cause, nothing).cells.edge, cause, nothing)
+
+
+def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edge:
+    """The edge with bounds between the values that parted unsafe steps from safe ones, finer than cells are."""
+    if not edge.bounds:
+        return edge
+    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
+    values = cause.of(steps.x)[:, agents, things, 0]
+    value = _of_the_worst(steps, values, signed(values, edge), agents)
+    left = explained.left > 0.5
+    size = (edge.high[0] - edge.low[0]) / CELLS[1]
+    bounds = list(edge.bounds)
+    for k, bound in enumerate(edge.bounds):
+        near = np.abs(value - bound) < AROUND * size
+        bad, fine = value[near & left], value[near & ~steps.unsafe]
+        if not edge.unseen[k] and len(bad) and len(fine):
+            bounds[k] = _parting(bad, fine, low_is_bad=(k % 2 == 0) == edge.inside)
+    seen = [bound for bound, unseen in zip(bounds, edge.unseen) if not unseen]
+    at = None if edge.at is None else round(seen[0], 4)
+    return msgspec.structs.replace(edge, bounds=tuple(sorted(bounds)), at=at)
+
+
+def signed(values: np.ndarray, edge: Edge) -> np.ndarray:
+    """Distances of values to where danger begins, below 0 in danger."""
+    offset = values[..., None] - np.array(edge.bounds)
+    safe = ((offset > 0).sum(-1) % 2 == 1) == edge.inside
+    return np.where(safe, 1.0, -1.0) * np.abs(offset).min(-1)
+
+
+def _of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: np.ndarray) -> np.ndarray:
+    """(T,) or (T, N) the values of the things in most danger; far off where an agent has none."""
+    if not steps.each:
+        return np.take_along_axis(values, score.argmin(1)[:, None], 1)[:, 0]
+    found = np.full(steps.unsafe.shape, np.inf)
+    for agent in np.unique(agents):
+        own = agents == agent
+        found[:, agent] = np.take_along_axis(values[:, own], score[:, own].argmin(1)[:, None], 1)[:, 0]
+    return found
+
+
+def least_wrong(steps: Steps, cause: Cause) -> int:
+    """How many steps a distance tells wrongly, by the edge below which danger begins that tells fewest so."""
+    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
+    values = cause.of(steps.x)[:, agents, things, 0]
+    nearest = _of_the_worst(steps, values, values, agents)
+    return int(_wrong(np.sort(nearest[steps.unsafe]), np.sort(nearest[~steps.unsafe]))[1].min())
+
+
+def _wrong(bad: np.ndarray, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(values, how many of bad and fine ones, which are sorted, an edge at each tells wrongly where low is bad)."""
+    tried = np.unique(np.concatenate([bad, fine]))
+    return tried, len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
+
+
+def _parting(bad: np.ndarray, fine: np.ndarray, low_is_bad: bool) -> float:
+    """The value that parts most unsafe steps from safe ones: in the middle of all that do as well."""
+    sign = 1.0 if low_is_bad else -1.0
+    tried, wrong = _wrong(np.sort(sign * bad), np.sort(sign * fine))
+    best = int(wrong.argmin())
+    following = tried[best + 1] if best + 1 < len(tried) else tried[best]
+    return float(sign * 0.5 * (tried[best] + following))
+
+
+def within(steps: Steps, cause: Cause, edge: Edge) -> np.ndarray:
+    """(T,) or (T, N) bool: somebody is in danger by a cause of one number."""
+    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
+    score = signed(cause.of(steps.x)[:, agents, things, 0], edge)
+    return _of_the_worst(steps, score, score, agents) < 0

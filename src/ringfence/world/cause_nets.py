@@ -23,10 +23,11 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.causes import Cause, Edge, Found
+from ringfence.world.causes import SLOPED, Cause, Edge, Found
 from ringfence.world.cells import CELLS, Cells
-from ringfence.world.readings import SEVERAL
+from ringfence.world.settings import Settings
 
+BATCH = 512  # steps
 HOT = 10.0  # temperature that learning begins with: many causes share a cost
 COOLED = 0.6  # share of the updates after which it is 1: odds add up
 MARGINAL = 0.05  # weight of the term by which each score explains the cost alone
@@ -72,21 +73,13 @@ class Distance(eqx.Module):
 
 
 Score = CauseNet | Distance
-
-
-def values_of(cause: Cause, x: Array) -> Array:
-    """(..., N, J, k) what a cause reads of features (..., N, D), as `Cause.of`; a length has a slope everywhere."""
-    read = x[..., np.array(cause.things)]
-    also = cause.read_also(x)
-    if not cause.length:
-        return jnp.stack(SEVERAL[cause.how](read, also), -1) if cause.also else read
-    lengths = [jnp.sqrt((part**2).sum(-1) + 1e-9) for part in cause.parts(read)]
-    return cause.in_one(lengths + cause.second(read, also))[..., None]
+# Of what scores are learned: features (M, N, D), predicted (T, N, D), row (T,), label (T,) or (T, N) bool of steps.
+Labelled = tuple[Array, Array, Array, Array]
 
 
 def scores(net: Score, x: Array) -> Array:
     """(..., N, J) of features (..., N, D), by thing; FAR of those that the cause is not about."""
-    found = net.of_values(values_of(net.cause, x))
+    found = net.of_values(net.cause.of(x, SLOPED))
     if not net.cause.who:
         return found
     return jnp.where(net.cause.holds(x.shape[-2]), found, FAR)
@@ -126,27 +119,25 @@ class _Learning(NamedTuple):
 def fit_causes(
     found: Found,
     cells: Sequence[Cells],
-    data: tuple[Array, Array, Array, Array],
+    data: Labelled,
     unsafe: np.ndarray,
     safe: np.ndarray,
     key: Key,
-    *,
-    share: float,
-    updates: int,
-    width: int,
-    batch: int = 512,
+    settings: Settings,
 ) -> tuple[Score, ...]:
     """Scores of the causes that were found, with these cells, from the same data as `barrier.fit_label`."""
     key_nets, key_fit = jax.random.split(key)
-    nets = tuple(_standardised(net, one) for net, one in zip(blank(found, width, key_nets), cells))
+    blanks = blank(found, settings.barrier_width, key_nets)
+    nets = tuple(_standardised(net, one) for net, one in zip(blanks, cells))
     rng = np.random.default_rng(0)
-    few = batch // 4
+    share, updates = settings.predicted_share, settings.barrier_updates
+    few = BATCH // 4
     if not any(isinstance(net, CauseNet) for net in nets):
         return nets  # distances are read off the logs; nothing is left to learn
     about = [net.cause.holds(data[0].shape[1]) for net in nets]
     about = np.concatenate(about, -1)
     about = about if data[3].ndim == 2 else about.reshape(-1)
-    every = jnp.floor(jnp.arange(1, batch + 1) * share) > jnp.floor(jnp.arange(batch) * share)
+    every = jnp.floor(jnp.arange(1, BATCH + 1) * share) > jnp.floor(jnp.arange(BATCH) * share)
     cooling = (HOT - 1.0) / max(1.0, COOLED * updates)
 
     def objective(learning: _Learning, data: tuple, pick: Array) -> Array:
@@ -156,7 +147,7 @@ def fit_causes(
         each = jnp.concatenate([scores(net, after) for net in learning.nets], -1)  # (B, N, K)
         truth = label[step].astype(jnp.float32)
         temperature = jax.lax.stop_gradient(learning.temperature)
-        apart = each if truth.ndim == 2 else each.reshape(batch, -1)
+        apart = each if truth.ndim == 2 else each.reshape(BATCH, -1)
         together = -temperature * jax.nn.logsumexp(-apart / temperature, -1)
         total = optax.sigmoid_binary_cross_entropy(-together, truth).mean()
         blamed = jnp.broadcast_to(truth[..., None], apart.shape)
@@ -175,7 +166,7 @@ def fit_causes(
     given = (*data, on_device(unsafe), on_device(safe), beyond)
     begun = _Learning(nets, jnp.float32(HOT))
     words = "barrier, what is dangerous now"
-    return regress(objective, begun, given, 2**31 - 1, key_fit, updates, batch, 2e-3, words, 1e-4, cooled).nets
+    return regress(objective, begun, given, 2**31 - 1, key_fit, updates, BATCH, 2e-3, words, 1e-4, cooled).nets
 
 
 def _fixed(net: Score, begun: Score) -> Score:
@@ -193,8 +184,9 @@ def _standardised(net: Score, cells: Cells) -> Score:
         given = [on_device(a, np.float32) for a in (np.array(net.edge.bounds) / span, span, sharp)]
         return eqx.tree_at(lambda n: (n.bounds, n.scale, n.log_gain), net, given)
     centres, _ = cells.known()
-    spread = np.maximum(centres.std(0), 1e-6)
-    if cells.cause.width > 1 and _alike(centres.std(0)):
+    deviation = centres.std(0)
+    spread = np.maximum(deviation, 1e-6)
+    if cells.cause.width > 1 and deviation.max() < 2 * deviation.min():  # as axes of a place do: directions are kept
         spread = np.full_like(spread, spread.mean())
     statistics = [on_device(a, np.float32) for a in (centres.mean(0), spread)]
     return eqx.tree_at(lambda n: (n.mean, n.scale), net, statistics)
@@ -216,8 +208,3 @@ def least_margin(net: Score) -> float:
     if isinstance(net, CauseNet):
         return LEAST
     return float(jnp.exp(net.log_gain)) * 0.5 / CELLS[1]
-
-
-def _alike(spread: np.ndarray) -> bool:
-    """Whether entries vary by about as much, as the axes of a place do: then directions are kept."""
-    return bool(spread.max() < 2 * spread.min())

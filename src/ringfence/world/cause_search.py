@@ -27,12 +27,30 @@ from ringfence.world.cause_candidates import (
     with_distances,
     with_vectors,
 )
-from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
-from ringfence.world.cause_edges import least_wrong, refined, within
-from ringfence.world.cause_siblings import siblings
-from ringfence.world.causes import Cause, Found, in_one_number, narrowed, only_of, only_where, with_an_axis_apart
-from ringfence.world.cells import Cells
-from ringfence.world.readings import How
+from ringfence.world.cause_counts import (
+    Counted,
+    Explained,
+    Steps,
+    counted,
+    gain,
+    least_wrong,
+    likelihood,
+    refined,
+    some_steps,
+    within,
+)
+from ringfence.world.causes import (
+    Cause,
+    Edge,
+    Found,
+    How,
+    in_one_number,
+    narrowed,
+    only_of,
+    only_where,
+    with_an_axis_apart,
+)
+from ringfence.world.cells import CELLS, Cells
 
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
@@ -46,6 +64,8 @@ FEW = 6  # episodes with danger, below which anything is
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which an axis is tried to count more or less, ever finer
 TRIED = (8, 3, 3, 3)  # such factors to either side
 RATIO_STEPS = 40_000  # steps that a ratio is looked for in
+ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too
+EPISODES = 2  # in which they have to be: one alone may be an accident
 
 
 def find(
@@ -59,7 +79,7 @@ def find(
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
     edges = [refined(steps, one.cells.edge, one.cause, _without(steps, chosen, one)) for one in chosen]
-    alike = siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
+    alike = _siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
     chosen += [one for one, _ in alike]
     edges += [edge for _, edge in alike]
     return replace(_summary(steps, chosen), edges=tuple(edges)), [one.cells for one in chosen]
@@ -171,7 +191,8 @@ def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Co
         told = gain(steps, explained, Explained.by(steps, parts).safe)[0]
         less = told < (1 - SIMPLER) * gain(steps, explained, one.safe)[0]
         both = [*rest, *parts]
-        if parts and not less and all(_is_left(steps, part, both) for part in both):
+        beside = (counted(steps, part.cause, _without(steps, both, part)) for part in both)
+        if parts and not less and all((part.cells.danger > 0.5).any() for part in beside):  # each has some of its own
             chosen = _pruned(steps, both)
     return chosen
 
@@ -202,11 +223,6 @@ def _about_whom(steps: Steps, causes: Iterable[Cause]) -> Iterator[Cause]:
             yield only_where(cause, held)
 
 
-def _is_left(steps: Steps, one: Counted, chosen: list[Counted]) -> bool:
-    """Whether a cause has danger of its own beside the others."""
-    return bool((counted(steps, one.cause, _without(steps, chosen, one)).cells.danger > 0.5).any())
-
-
 def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
     """Causes of all agents and of some alone, of which nearly all steps that they call unsafe are: those of one entry
     first, then lengths, then all others."""
@@ -229,12 +245,6 @@ def _of_fewer(steps: Steps, one: Counted, explained: Explained) -> Counted:
         if rest and (fewer := counted(steps, narrowed(best.cause, rest), explained)).gain >= best.gain:
             best = fewer
     return best
-
-
-def _purity(steps: Steps, one: Counted) -> float:
-    """Share of the steps that a cause calls unsafe, and that are."""
-    called = one.called.sum()
-    return float((one.called & steps.unsafe).sum() / called) if called else 0.0
 
 
 def _grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
@@ -335,8 +345,11 @@ def _complexity(cause: Cause) -> tuple[int, bool, bool, bool]:
 
 
 def _gain_if(steps: Steps, one: Counted, pure: float) -> float:
-    """What a cause gains; nothing where it is less pure than that."""
-    return 0.0 if pure and _purity(steps, one) < pure else one.gain
+    """What a cause gains; nothing where it is less pure than that: fewer of the steps that it calls unsafe are."""
+    if not pure:
+        return one.gain
+    called = one.called.sum()
+    return one.gain if called and (one.called & steps.unsafe).sum() / called >= pure else 0.0
 
 
 def _best_wider(steps: Steps, best: Counted, explained: Explained, names: Sequence[str]) -> Counted | None:
@@ -369,3 +382,63 @@ def _summary(steps: Steps, chosen: list[Counted]) -> Found:
     share, false_alarms = explained(np.logical_or.reduce([one.called for one in chosen]))
     shares = tuple(round(explained(one.called)[0], 4) for one in chosen)
     return Found(tuple(one.cause for one in chosen), round(share, 4), round(false_alarms, 4), shares)
+
+
+# --- entries that are dangerous where another one is ---
+
+
+def _siblings(
+    steps: Steps, chosen: Sequence[Counted], edges: Sequence[Edge], names: Sequence[str]
+) -> list[tuple[Counted, Edge]]:
+    """Entries, with where they are dangerous, that are no cause yet, and that tell unsafe steps which no cause tells by
+    the edges of one. Too few steps show them to be found by themselves: of vehicles in a row the second and the third
+    touched a hundred times, the first and the second twice. Twice is enough where another entry has told where danger
+    begins, and nothing contradicts. Only edges at which danger was seen to begin and to end are tried: they fit hardly
+    anything by chance."""
+    known = {one.cause for one in chosen}
+    alike = [edge for one, edge in zip(chosen, edges) if _is_plain(one.cause) and _between(edge)]
+    if not alike:
+        return []
+    explained = Explained.by(steps, chosen)
+    called = [within(steps, one.cause, edge) for one, edge in zip(chosen, edges) if edge.bounds]
+    left = steps.unsafe & ~np.logical_or.reduce(called)
+    found = []
+    for cause in candidates(names):
+        if not _is_plain(cause) or cause in known:
+            continue
+        for edge in (_moved(edge, cause.of(steps.x)) for edge in alike):
+            inside = within(steps, cause, edge)
+            if _is_told(steps, inside & left, inside & ~steps.unsafe):
+                found.append((counted(steps, cause, explained), edge))
+                left &= ~inside
+                break
+    return found
+
+
+def _is_plain(cause: Cause) -> bool:
+    """Whether it is one entry, of all agents."""
+    return cause.width == 1 and not cause.length and not cause.who
+
+
+def _between(edge: Edge) -> bool:
+    """Whether danger was seen to begin and to end."""
+    return len(edge.bounds) - sum(edge.unseen) >= 2
+
+
+def _is_told(steps: Steps, unsafe: np.ndarray, safe: np.ndarray) -> bool:
+    """Whether steps, each (T,) or (T, N) bool, are unsafe nearly always, and in more than one episode."""
+    in_danger = unsafe if unsafe.ndim == 1 else unsafe.any(1)
+    episodes = np.unique(steps.episode[in_danger])
+    return len(episodes) >= EPISODES and bool(unsafe.sum() >= ALIKE * (unsafe.sum() + safe.sum()))
+
+
+def _moved(edge: Edge, values: np.ndarray) -> Edge:
+    """The edge for another entry: where the logs end is that one's own affair."""
+    low, high = float(values.min()), float(values.max())
+    beyond = (high - low) / CELLS[1]
+    bounds = list(edge.bounds)
+    if edge.unseen[0]:
+        bounds[0] = min(low - beyond, bounds[1])
+    if edge.unseen[-1]:
+        bounds[-1] = max(high + beyond, bounds[-2])
+    return replace(edge, low=(round(low, 4),), high=(round(high, 4),), bounds=tuple(bounds))

@@ -1,15 +1,23 @@
-"""Causes of danger: few entries that tell it by themselves, and where they begin to."""
+"""Causes of danger: few entries that tell it by themselves, where they begin to, and what is read of them.
+
+What is read of several together is read of NumPy's arrays and of JAX's alike. `offset` (..., k) is where things are,
+`also` (..., m) what else is read.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.readings import SEVERAL, How, in_one, second, shortest
+SLOPED = 1e-9  # of squares, by which their root has a slope at 0, too
+# Nothing more; as several numbers, see SEVERAL; in one, see `Cause._second`.
+How = Literal["", "nearing", "beside", "turned", "vector", "both", "high", "low", "ahead", "coming", "soon"]
 
 
 class Cause(msgspec.Struct, frozen=True):
@@ -56,25 +64,30 @@ class Cause(msgspec.Struct, frozen=True):
         """Whether it reads how far something is, or how long, and nothing else."""
         return self.length and not self.also and self.nearest is None
 
-    def of(self, x: np.ndarray) -> np.ndarray:
-        """(..., J, width) what it reads of features (..., D)."""
+    def of(self, x: Any, least: float = 0.0) -> Any:
+        """(..., J, width) what it reads of features (..., D), NumPy's or JAX's. A length whose `least` square is SLOPED
+        has a slope everywhere."""
+        numbers = _numbers_of(x)
         read = x[..., np.array(self.things)]
-        also = self.read_also(x)
+        also = x[..., np.array(self.also)] if self.also else None
+        if also is not None and self.against:
+            also = -also
         if not self.length:
-            return np.stack(SEVERAL[self.how](read, also), -1) if self.also else read
-        lengths = [np.sqrt((part**2).sum(-1)) for part in self.parts(read)]
-        return self.in_one(lengths + self.second(read, also))[..., None]
+            return read if also is None else numbers.stack(SEVERAL[self.how](read, also), -1)
+        lengths = [numbers.sqrt((part**2).sum(-1) + least) for part in self.parts(read)]
+        return self.in_one(lengths if also is None else [*lengths, self._second(read, also)])[..., None]
 
-    def read_also(self, x: Any) -> Any:
-        """(..., J, m) what is read of `also` in features (..., D), NumPy's or JAX's; None where there is none."""
-        if not self.also:
-            return None
-        also = x[..., np.array(self.also)]
-        return -also if self.against else also
-
-    def second(self, read: Any, also: Any) -> list[Any]:
-        """Of a length, what it reads of other entries (..., m), NumPy's or JAX's, if it reads any."""
-        return [second(self.how, read, also, self.end)] if self.also else []
+    def _second(self, offset: Any, also: Any) -> Any:
+        """(...,) the number that is read beside a distance: by how much an entry is below its highest value, or above
+        its lowest, at `end`; by what angle (rad) things are off a direction, to either side; by how much slower they
+        come nearer than ever; or how fast."""
+        if self.how == "ahead":
+            ahead, left = turned(offset, also)
+            return _numbers_of(left).arctan2((left**2 + SLOPED) ** 0.5, ahead)  # with a slope where it is right ahead
+        other = (nearing if self.how in ("soon", "coming") else beside)(offset, also)[1]
+        if self.how == "soon":
+            return other
+        return other - self.end if self.how == "low" else self.end - other
 
     def parts(self, read: Any) -> list[Any]:
         """Of a length: the entries (..., k) of each vector of which the longest counts; of several things (..., K, k)
@@ -87,13 +100,16 @@ class Cause(msgspec.Struct, frozen=True):
         return [read[..., np.array(rest)], read[..., self.apart : self.apart + 1]]
 
     def in_one(self, lengths: Sequence[Any]) -> Any:
-        """Of the lengths of its parts, or of a length and a second number, NumPy's or JAX's: what it reads."""
+        """What it reads of the lengths of its parts, or of a length and a second number, NumPy's or JAX's: the longer,
+        of which the second counts so much more, so that it is low where both are; how far things will be in so long a
+        time; or the k-th shortest of lengths (..., K)."""
+        far = lengths[0]
         if self.nearest is not None:
-            return shortest(lengths[0], self.nearest[0])
+            return _numbers_of(far).sort(far, axis=-1)[..., self.nearest[0] - 1]
         if len(lengths) == 1:
-            return lengths[0]
-        one, other = lengths
-        return in_one(self.how, one, other, self.ratio)
+            return far
+        other = self.ratio * lengths[1]
+        return far - other if self.how == "soon" else _numbers_of(far).maximum(far, other)
 
     def holds(self, n_agents: int) -> np.ndarray:
         """(N, J) bool: the agents and things that it is about."""
@@ -169,3 +185,52 @@ def with_an_axis_apart(cause: Cause, axis: int, ratio: float) -> Cause:
     rest = ", ".join(name for k, name in enumerate(entries) if k != axis)
     name = f"{kind}.{rest} or {ratio:.3g} {entries[axis]}, the longer"
     return narrowed(replace(of_all, name=name, apart=axis, ratio=ratio), cause.who)
+
+
+# --- what is read of how far things are together with something more ---
+
+
+def nearing(offset: Any, velocity: Any) -> tuple[Any, Any]:
+    """How far things are, and how fast that comes nearer."""
+    far = _length(offset)
+    return far, -(offset * velocity).sum(-1) / far
+
+
+def beside(offset: Any, also: Any) -> tuple[Any, Any]:
+    """How far things are, and another entry, or how long several are as a vector."""
+    return _length(offset), also[..., 0] if also.shape[-1] == 1 else _length(also)
+
+
+def turned(offset: Any, direction: Any) -> tuple[Any, Any]:
+    """How far ahead of who looks into a direction, a vector or an angle, things are, and how far to the left."""
+    x, y = offset[..., 0], offset[..., 1]
+    cos, sin = direction[..., 0], direction[..., -1]
+    if direction.shape[-1] == 1:
+        numbers = _numbers_of(direction)
+        cos, sin = numbers.cos(cos), numbers.sin(sin)
+    else:
+        long = _length(direction)
+        cos, sin = cos / long, sin / long
+    return x * cos + y * sin, y * cos - x * sin
+
+
+def with_vector(entries: Any, also: Any) -> tuple[Any, ...]:
+    """Entries, and how long others are as a vector."""
+    return *(entries[..., k] for k in range(entries.shape[-1])), _length(also)
+
+
+def both(offset: Any, place: Any) -> tuple[Any, ...]:
+    """Where one is oneself, and where things are."""
+    axes = range(place.shape[-1])
+    return *(place[..., k] for k in axes), *(place[..., k] + offset[..., k] for k in axes)
+
+
+SEVERAL = {"nearing": nearing, "beside": beside, "turned": turned, "vector": with_vector, "both": both}
+
+
+def _length(vectors: Any) -> Any:
+    return ((vectors**2).sum(-1) + SLOPED) ** 0.5
+
+
+def _numbers_of(array: Any) -> Any:
+    return jnp if isinstance(array, jax.Array) else np

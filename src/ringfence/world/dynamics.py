@@ -8,29 +8,81 @@ It is fitted long enough to learn contacts. A few thousand updates predict free 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import optax
 
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem import partners
+from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import varying
 from ringfence.problem.others import others
 from ringfence.problem.turns import pointing, within
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.heading import AHEAD, Heading
+from ringfence.world.settings import Settings
 
+AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
 Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
 STATES = 20_000  # steps that features and their changes are standardised by
 BATCH = 128  # small and often: at equal time it learns contacts that 512 at half the rate does not
+
+
+class Heading(msgspec.Struct, frozen=True):
+    """Entries that tell how fast a body that looks into a direction goes ahead: its velocity, or its speed, and that
+    direction."""
+
+    velocity: tuple[int, ...]  # two, or the speed
+    direction: tuple[int, int]
+    relative: tuple[tuple[int, int], ...] = ()  # velocities of things less one's own, and along which axis
+
+    @classmethod
+    def of(cls, names: Sequence[str]) -> Heading | None:
+        """None where names tell of none."""
+        known = Entries.of(names)
+        if len(known.direction) < 2:
+            return None
+        cos, sin = known.direction
+        axes = known.axes[:2]
+        drifts = [e for e in known.each if e.role == "drift" and e.whose != "own" and e.axis in axes]
+        relative = tuple((e.source, axes.index(e.axis)) for e in drifts)
+        if velocity := known.pair("v{}"):
+            return cls(velocity, (cos, sin), relative)
+        return None if known.speed is None else cls((known.speed,), (cos, sin), relative)
+
+    @property
+    def about(self) -> tuple[int, ...]:
+        """Entries that are relative to the velocity."""
+        return tuple(entry for entry, _ in self.relative)
+
+    def speed(self, x: Any) -> Any:
+        """(...) ahead, of features (..., D), NumPy's or JAX's: negative of who goes backwards."""
+        if len(self.velocity) == 1:
+            return x[..., self.velocity[0]]
+        cos, sin = (x[..., d] for d in self.direction)
+        vx, vy = (x[..., v] for v in self.velocity)
+        return (vx * cos + vy * sin) / (cos**2 + sin**2 + 1e-9) ** 0.5
+
+    def no_slower(self, x: Array, least: float) -> Array:
+        """Features (..., D) with that speed ahead at least, and what is relative to it as much less."""
+        lacks = jnp.maximum(least - self.speed(x), 0.0)[..., None]
+        direction = x[..., np.array(self.direction)]
+        length = jnp.sqrt((direction**2).sum(-1, keepdims=True) + 1e-9)
+        faster = lacks * direction / length
+        x = x.at[..., np.array(self.velocity)].add(faster if len(self.velocity) == 2 else lacks)
+        if not self.relative:
+            return x
+        axes = np.array([axis for _, axis in self.relative])
+        return x.at[..., np.array(self.about)].add(-faster[..., axes])
 
 
 class Dynamics(eqx.Module):
@@ -136,15 +188,7 @@ def slowest(map: FeatureMap, ranges: Mapping[str, tuple[float, float]] | None) -
 
 
 def fit_dynamics(
-    features: Array,
-    actions: Array,
-    row: Array,
-    map: FeatureMap,
-    key: Key,
-    *,
-    num_ensemble: int,
-    updates: int,
-    width: int,
+    features: Array, actions: Array, row: Array, map: FeatureMap, key: Key, settings: Settings
 ) -> Dynamics:
     """The ensemble of a data set: features (M, N, D); actions (T, N, A) of the T steps, each from row `row` (T,) to the
     next. The loss is Huber's, in standard deviations of the step: it keeps the kicks of contacts, which dwarf
@@ -152,12 +196,14 @@ def fit_dynamics(
     key_nets, key_states, key_fit = jax.random.split(key, 3)
     drawn = jax.random.randint(key_states, (min(STATES, 4 * len(row)),), 0, len(row))
     some = np.asarray(row)[np.asarray(drawn)]
+    members = settings.num_ensemble
     shown = slice(0, 1) if map.joint else slice(None)
     states = np.asarray(features)[:, shown]
     before = states[some].reshape(-1, states.shape[-1]).astype(np.float64)
     after = states[some + 1].reshape(before.shape).astype(np.float64)
-    model = _standardised(blank_dynamics(map, actions.shape[-1], num_ensemble, width), before, after)
-    nets = _networks(key_nets, map, actions.shape[-1], num_ensemble, width)
+    shape = map, actions.shape[-1], members, settings.dynamics_width
+    model = _standardised(blank_dynamics(*shape), before, after)
+    nets = _networks(key_nets, *shape)
     whose = others(map.plus.shape[0])
 
     def of_member(nets: tuple[MLP, MLP | None], before: Array, action: Array, after: Array, seen: Seen | None) -> Array:
@@ -179,11 +225,12 @@ def fit_dynamics(
             who = (seen[0][row[step]], seen[1][row[step]]) if seen else None
             return of_member(nets, features[row[step]], actions[step], features[row[step] + 1], who)
 
-        return jax.vmap(of)(nets, pick.reshape(num_ensemble, -1)).sum()
+        return jax.vmap(of)(nets, pick.reshape(members, -1)).sum()
 
     data = features, actions, row, *(partners.seen_in(map.mirrored, features, model.scale) if map.mirrored else ())
     label = "forward dynamics, what actions do"
-    return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * num_ensemble, 4e-3, label))
+    updates = settings.dynamics_updates
+    return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * members, 4e-3, label))
 
 
 def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dynamics:

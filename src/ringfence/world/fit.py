@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,19 +31,15 @@ from ringfence.utils.files import whole, writable
 from ringfence.utils.progress import Parts
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
-from ringfence.world import cause_search, dynamics, impacts, margins, validate, values
-from ringfence.world.card import Card, Data
+from ringfence.world import cause_search, dynamics, impacts, judging, margins, values
+from ringfence.world.card import Card, Data, Settings
 from ringfence.world.cause_candidates import offsets
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import Found
 from ringfence.world.cells import Cells
-from ringfence.world.heading import AHEAD, Heading
+from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
-from ringfence.world.look import look_of
-from ringfence.world.model import World
-from ringfence.world.settings import Settings
-from ringfence.world.storage import blank_barrier, blank_world, load, save
-from ringfence.world.verdict import judge
+from ringfence.world.model import World, blank_world, load, save
 
 FORMAT = 6  # of what is fitted, found and told: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
@@ -71,102 +66,141 @@ PARTS = {
 UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}
 
 T = TypeVar("T")
-Search = Callable[[World, Logged], float | None]  # share of what a guard's search calls safe, and the logs dangerous
 
 
-def fit_view(
-    store: EpisodeStore,
-    map: features.FeatureMap,
-    spec: Spec,
-    settings: Settings,
-    *,
-    hazard: constraints.BoundHazard | None = None,
-    seed: int = 0,
-    cached: bool = True,
-    bar: Parts | None = None,
-    search: Search | None = None,
-) -> World:
-    """The World of a store in the view `map` of `spec`; from the cache where it has been fitted before.
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A World to be fitted: the store's, in the view `map` of `spec`. `hazard`, bound to the view, labels states where
+    `settings.labels` is "formula". Of the same data, settings and seed parts are taken from the cache, and the World
+    once it is kept there."""
 
-    `hazard`, bound to the view, labels states where `settings.labels` is "formula". A tenth of the episodes is held
-    out of every part; the card says how good the World is on them, and by `search` what a guard would find in it.
-    """
-    formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
-    parts = _Parts(settings, seed, formula, cached, bar or Parts("", (), quiet=True))
-    card = store.card  # `content` of agents who see for themselves is of the whole team's logs
-    told = [card.task, card.hazard, card.dt, card.content, card.action_delay, card.origins, _agents(store)]
-    file = parts.file("world", [store.content, features.to_dict(map), card.bounds, store.limits, *told])
-    if cached and (kept := _kept_world(file, map, store, settings, seed)) is not None:
-        return kept
-    if cached:
-        writable(file)
-    world = _fitted(store, map, spec, hazard, parts, search)
-    if cached:
-        save(world, file)
-    return world
+    store: EpisodeStore
+    map: features.FeatureMap
+    spec: Spec
+    settings: Settings
+    hazard: constraints.BoundHazard | None
+    seed: int
+    cached: bool
+    bar: Parts
+
+    def kept(self) -> World | None:
+        """The World in the cache; None where there is none, a damaged one, or one of other data, settings or seed,
+        which somebody has put there."""
+        if not self.cached:
+            return None
+        try:
+            found = load(self.world_file, lambda *_: self.map) if self.world_file.exists() else None
+        except UserError:
+            found = None
+        about = self.store.card.content or self.store.content, self.settings, self.seed
+        if found is not None and (found.card.data.content, found.card.settings, found.card.seed) == about:
+            return found
+        writable(self.world_file)  # before minutes are spent
+        return None
+
+    def keep(self, world: World) -> World:
+        """The World, which is in the cache from now on."""
+        if self.cached:
+            save(world, self.world_file)
+        return world
+
+    @functools.cached_property
+    def world_file(self) -> Path:
+        """Where the World is kept."""
+        store, card = self.store, self.store.card  # `content` of agents who see for themselves is of the whole team's
+        told = [card.task, card.hazard, card.dt, card.content, card.action_delay, card.origins, _agents(store)]
+        asked = dataclasses.asdict(judging.JUDGING)
+        return self.file("world", [store.content, features.to_dict(self.map), card.bounds, store.limits, *told, asked])
+
+    def file(self, name: str, content: list[Any], of: Sequence[str] | None = None) -> Path:
+        """Where what depends on `content` and on the settings is kept: on those of the parts `of`, or on all."""
+        settings = dataclasses.asdict(self.settings)
+        by_formula = self.settings.labels == "formula" and (of is None or "label" in of)
+        formula = constraints.to_dict(self.hazard.hazard) if self.hazard is not None and by_formula else None
+        if of is not None:
+            read = {"view", "execution", *(field for part in of for field in PARTS[part])}
+            settings = {field: value for field, value in settings.items() if field in read}
+        about = [FORMAT, name, content, settings, self.seed, formula]
+        written = msgspec.json.encode(about, enc_hook=np.ndarray.tolist, order="deterministic")
+        code = hashlib.sha256(written).hexdigest()[:16]
+        return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+
+    def found(self, name: str, content: list[Any], kind: type[T], make: Callable[[], T]) -> T:
+        """What is found about a part before it is fitted; made, and then kept, where it is not there."""
+        file = self.file(name, content, ["label"]).with_suffix(".json")
+        if self.cached and file.exists():
+            try:
+                return msgspec.json.decode(file.read_bytes(), type=kind)
+            except (OSError, msgspec.MsgspecError):
+                pass
+        with self.bar.part(name):
+            made = make()
+        if self.cached:
+            with whole(file) as temporary:
+                Path(temporary).write_bytes(msgspec.json.encode(made))
+        return made
+
+    def part(self, name: str, content: list[Any], template: T, make: Callable[[Key], T]) -> T:
+        """The part of that name, likewise."""
+        file = self.file(name, content, [*UPON[name], name])
+        if self.cached and (kept := _read(file, template)) is not None:
+            self.bar.skip(name)
+            return kept
+        with self.bar.part(name):
+            made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
+        if self.cached:
+            save_named(file, named_arrays(made), {"key": file.stem})
+        return made
 
 
-def _fitted(
-    store: EpisodeStore,
-    map: features.FeatureMap,
-    spec: Spec,
-    hazard: constraints.BoundHazard | None,
-    parts: _Parts,
-    search: Search | None,
-) -> World:
-    begun = time.perf_counter()
-    settings = parts.settings
-    if settings.execution == "decentralized":
+def _read(file: Path, template: T) -> T | None:
+    """A cached part; None where there is none, a damaged one, or another's."""
+    if not file.exists():
+        return None
+    try:
+        with safe_open(file, "numpy") as opened:
+            key = (opened.metadata() or {}).get("key")
+        return load_named(file, template) if key == file.stem else None
+    except (SafetensorError, OSError, UserError):
+        return None
+
+
+def fitted(of: Fit) -> tuple[World, Logged, Logged]:
+    """A World that nobody has judged, whose card says of what it is; and the logs that are to judge it, with a tenth of
+    the episodes held out of every part: as they were learned from, cut at impacts, and as they are."""
+    store, map, settings = of.store, of.map, of.settings
+    if settings.alone:
         map = features.alone(map)
-    labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
-    out = held_out(store, parts.seed, unsafe_of(labels) if labels else None)
-    whole = logged = Logged.of(store, map, out, labels)
+    labels = labels_of(store, map, settings, of.hazard) if settings.barrier else {}
+    out = held_out(store, of.seed, unsafe_of(labels) if labels else None)
+    as_they_are = logged = Logged.of(store, map, out, labels)
     arrays = store.digest("observations", "state", "actions", "episode_ends", "terminated")
     moved = [arrays, _digest(out), store.card.bounds, map.turns, _digest(map.plus), _digest(map.minus)]
 
-    world = blank_world(map, spec, settings)
-    value = _values(logged, moved, world.values, parts)
-    thrown = impacts.count(logged, parts.seed) if labels and settings.labels == "costs" else 0
+    blank = blank_world(map, of.spec, settings)
+    value = _values(logged, moved, blank.values, of)
+    thrown = impacts.count(logged, of.seed) if labels and settings.labels == "costs" else 0
     steps = logged.fitted_steps
     if thrown:
         steps = steps[~logged.unsafe[steps]]
         moved.append(_digest(logged.unsafe))
-    acts = _dynamics(logged, steps, moved, world.dynamics, parts)
+    acts = _dynamics(logged, steps, moved, blank.dynamics, of)
     if map.mirrored:
-        acts = _with_partners(acts, logged, steps, moved, parts)
+        acts = _with_partners(acts, logged, steps, moved, of)
         moved.append(acts.map.mirrored)
     if thrown:
         logged = impacts.landed(logged, acts)
-    barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts)
-    world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
-
-    with parts.bar.part("card"):
-        found = validate.validate(world, logged, whole, settings.miscoverage, settings.loss)
-    seconds = parts.bar.seconds | {"in all": time.perf_counter() - begun}
+    barrier, causes = _barrier(logged, tuple(labels), moved, acts, of)
     card = Card(
         format=FORMAT,
         data=_data(store, logged, thrown, bool(acts.map.mirrored)),
         settings=settings,
-        seed=parts.seed,
+        seed=of.seed,
         shape=_shape_in_words(barrier),
-        causes=found_by,
-        seconds={name: round(took, 1) for name, took in seconds.items()},
-        held_out=found.held_out,
-        prediction_error=found.prediction_error,
-        values=found.values,
-        ood=found.ood,
-        barrier=found.scores,
-        constraints=found.constraints,
+        causes=causes,
     )
-    threshold = jnp.asarray(found.ood.threshold, jnp.float32)
-    acts = dataclasses.replace(acts, ahead=dynamics.slowest(map, card.data.ranges))
-    world = dataclasses.replace(world, dynamics=acts, barrier=found.barrier, ood_threshold=threshold, card=card)
-    with parts.bar.part("search"):
-        wrong = None if search is None else search(world, logged)
-    if wrong is not None and card.barrier is not None:
-        card = msgspec.structs.replace(card, barrier=msgspec.structs.replace(card.barrier, searched=round(wrong, 4)))
-    card = msgspec.structs.replace(card, verdict=judge(card), look=look_of(card))
-    return dataclasses.replace(world, card=card)
+    world = World(acts, value, barrier, jnp.ones(()), map, of.spec, settings.alone, card)
+    return world, logged, as_they_are
 
 
 def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> Data:
@@ -246,90 +280,122 @@ def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
 
 
 def _dynamics(
-    logged: Logged,
-    steps: np.ndarray,
-    moved: list[Any],
-    blank: dynamics.Dynamics,
-    parts: _Parts,
+    logged: Logged, steps: np.ndarray, moved: list[Any], blank: dynamics.Dynamics, of: Fit
 ) -> dynamics.Dynamics:
     """Of these steps."""
-    settings = parts.settings
 
     def fit(key: Key) -> dynamics.Dynamics:
-        return dynamics.fit_dynamics(
-            logged.arrays["features"],
-            on_device(logged.picked("actions", steps)),
-            on_device(logged.picked("row", steps)),
-            blank.map,
-            key,
-            num_ensemble=settings.num_ensemble,
-            updates=settings.dynamics_updates,
-            width=settings.dynamics_width,
-        )
+        actions, row = (on_device(logged.picked(name, steps)) for name in ("actions", "row"))
+        return dynamics.fit_dynamics(logged.arrays["features"], actions, row, blank.map, key, of.settings)
 
-    return parts.get("dynamics", moved, blank, fit)
+    return of.part("dynamics", moved, blank, fit)
 
 
 def _with_partners(
-    plain: dynamics.Dynamics, logged: Logged, steps: np.ndarray, moved: list[Any], parts: _Parts
+    plain: dynamics.Dynamics, logged: Logged, steps: np.ndarray, moved: list[Any], of: Fit
 ) -> dynamics.Dynamics:
     """The dynamics that read what those do who are in lists of the nearest, if they predict held-out windows better
     than plain ones: in long lists they learn by heart who does what."""
-    settings = parts.settings
     action = logged.arrays["actions"].shape[-1]
-    blank = dynamics.blank_dynamics(logged.map, action, settings.num_ensemble, settings.dynamics_width)
-    told = _dynamics(logged, steps, [*moved, logged.map.mirrored], blank, parts)
-    errors = [validate.prediction_error(each, logged, np.random.default_rng(4)) for each in (told, plain)]
+    blank = dynamics.blank_dynamics(logged.map, action, of.settings.num_ensemble, of.settings.dynamics_width)
+    told = _dynamics(logged, steps, [*moved, logged.map.mirrored], blank, of)
+    asked = judging.JUDGING
+    errors = [judging.prediction_error(each, logged, np.random.default_rng(4), asked) for each in (told, plain)]
     ours, theirs = (np.mean(error.error_of_change) for error in errors)
     return told if ours < theirs else plain
 
 
-def _values(logged: Logged, moved: list[Any], blank: values.Values, parts: _Parts) -> values.Values:
-    settings = parts.settings
-    alone = settings.execution == "decentralized"
+def _values(logged: Logged, moved: list[Any], blank: values.Values, of: Fit) -> values.Values:
+    settings = of.settings
 
     def fit(key: Key) -> values.Values:
-        return values.fit_values(
-            logged.arrays | {"returns_to_go": logged.returns_to_go(settings.discount, alone)},
-            on_device(logged.fitted_steps),
-            logged.map,
-            key,
-            discount=settings.discount,
-            updates=settings.value_updates,
-            period=logged.longest,
-            alone=alone,
-        )
+        arrays = logged.arrays | {"returns_to_go": logged.returns_to_go(settings.discount, settings.alone)}
+        return values.fit_values(arrays, on_device(logged.fitted_steps), logged.map, key, settings, logged.longest)
 
-    return parts.get("values", [*moved, logged.store.digest("rewards")], blank, fit)
+    return of.part("values", [*moved, logged.store.digest("rewards")], blank, fit)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """The search for the causes of one constraint's danger, made at most once."""
+class _Danger:
+    """The danger of one constraint, of which a barrier is made."""
 
     logged: Logged
-    seed: int
+    moved: list[Any]
+    acts: dynamics.Dynamics
+    of: Fit
+
+    def barrier(self) -> tuple[Found, cbf.Barrier]:
+        """Its causes, and ℓ and V by them; no causes, and networks on all entries, where held-out steps say that
+        these tell more."""
+        found = self.causes()
+        label = self.label(found)
+        if found.causes and (recall := self._recall(label)) < ENOUGH:
+            plain = self.label(Found())
+            if self._recall(plain) > recall:
+                found, label = Found(), plain
+        return found, self.with_future(label, found)
+
+    def _recall(self, label: cbf.Barrier) -> float:
+        return judging.recall(label, self.logged, judging.JUDGING)
+
+    def causes(self) -> Found:
+        """None where few entries do not explain it, or where it is of a whole body."""
+        settings = self.of.settings
+        plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
+        if not plain or self.logged.map.shared_body or self.logged.map.joint:
+            return Found()
+        found = self.of.found("causes", self._content(), Found, lambda: self.search[0])
+        return found if found.explained >= EXPLAINED else Found()
 
     @functools.cached_property
-    def result(self) -> tuple[Found, list[Cells]]:
-        """What is found, and the cells of each cause."""
+    def search(self) -> tuple[Found, list[Cells]]:
+        """What a search for causes finds, and the cells of each; made at most once."""
         logged = self.logged
         steps = logged.fitted_steps
-        x = logged.after(steps)
         episode = logged.store.episode_of_step[steps]
-        return cause_search.find(x, logged.label[steps], episode, logged.map.names, self.seed)
+        return cause_search.find(logged.after(steps), logged.label[steps], episode, logged.map.names, self.of.seed)
 
+    def _content(self, *found: Found) -> list[Any]:
+        """What a barrier is made of, beside its settings."""
+        return [*self.moved, _digest(self.logged.label), self.logged.map.names, *found]
 
-def _causes(search: _Search, moved: list[Any], parts: _Parts) -> Found:
-    """The causes of one constraint's danger; none where few entries do not explain it, or is of a whole body."""
-    settings = parts.settings
-    logged = search.logged
-    plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
-    if not plain or logged.map.shared_body or logged.map.joint:
-        return Found()
-    content = [*moved, _digest(logged.label), logged.map.names]
-    found = parts.json("causes", content, Found, lambda: search.result[0])
-    return found if found.explained >= EXPLAINED else Found()
+    def _blank(self, found: Found) -> cbf.Barrier:
+        return eqx.filter_eval_shape(cbf.blank_barrier, self.logged.map, self.of.settings, found)
+
+    def label(self, found: Found) -> cbf.Barrier:
+        """ℓ, with the statistics that it reads by."""
+        return self.of.part("label", self._content(found), self._blank(found), lambda key: self._label(found, key))
+
+    def _label(self, found: Found, key: Key) -> cbf.Barrier:
+        logged = self.logged
+        settings = self.of.settings
+        key_states, key_fit = jax.random.split(key)
+        steps = logged.fitted_steps
+        unsafe = logged.unsafe[steps]
+        if unsafe.all() or not unsafe.any():
+            raise UserError(
+                f"All unsafe steps of '{logged.store.card.task}' lie in the episodes that are held out; log more of "
+                "them, or take another seed."
+            )
+        arrays = logged.arrays
+        data = arrays["features"], logged.predicted(self.acts), arrays["row"], on_device(logged.label)
+        given = data, steps[unsafe], steps[~unsafe], key_fit, settings
+        blank = _standardised(cbf.blank_barrier(logged.map, settings, found), logged, key_states)
+        if not found.causes:
+            return cbf.fit_label(blank, *given)
+        nets = fit_causes(found, self.search[1], *given)
+        nets = margins.in_own_margins(nets, self.acts, logged, np.random.default_rng(0))
+        return dataclasses.replace(blank, causes=nets)
+
+    def with_future(self, label: cbf.Barrier, found: Found) -> cbf.Barrier:
+        """V beside ℓ."""
+
+        def fit(key: Key) -> cbf.Barrier:
+            steps = self.logged.fitted_steps
+            close = steps[self.logged.close_to_danger()[steps]]
+            return cbf.fit_future(label, self.logged.arrays, steps, close, key, self.of.settings)
+
+        return self.of.part("future", self._content(found), self._blank(found), fit)
 
 
 def _digest(array: np.ndarray) -> str:
@@ -337,107 +403,15 @@ def _digest(array: np.ndarray) -> str:
 
 
 def _barrier(
-    logged: Logged, names: tuple[str, ...], moved: list[Any], acts: dynamics.Dynamics, parts: _Parts
+    logged: Logged, names: tuple[str, ...], moved: list[Any], acts: dynamics.Dynamics, of: Fit
 ) -> tuple[cbf.Barrier | cbf.MinBarrier | None, dict[str, Found]]:
     """The barrier of all constraints, and the causes of the danger of each; None where there are none."""
-    searches = {name: _Search(logged.by(name), parts.seed) for name in names}
-    labels = {name: _label_of(search, moved, acts, parts) for name, search in searches.items()}
-    causes = {name: found for name, (found, _) in labels.items()}
-    each = [_with_future(labels[name][1], search, moved, causes[name], parts) for name, search in searches.items()]
+    made = {name: _Danger(logged.by(name), moved, acts, of).barrier() for name in names}
+    causes = {name: found for name, (found, _) in made.items()}
+    each = tuple(barrier for _, barrier in made.values())
     if not each:
         return None, causes
-    return cbf.MinBarrier(tuple(each), names) if logged.several else each[0], causes
-
-
-def _label_of(search: _Search, moved: list[Any], acts: dynamics.Dynamics, parts: _Parts) -> tuple[Found, cbf.Barrier]:
-    """The causes of one constraint's danger, and ℓ by them; no causes, and ℓ by networks on all entries, where held-out
-    steps say that these tell more."""
-    found = _causes(search, moved, parts)
-    label = _labelled(search, moved, acts, found, parts)
-    if not found.causes:
-        return found, label
-    recall = validate.recall(label, search.logged)
-    if not recall < ENOUGH:
-        return found, label
-    plain = _labelled(search, moved, acts, Found(), parts)
-    if validate.recall(plain, search.logged) > recall:
-        return Found(), plain
-    return found, label
-
-
-def _labelled(search: _Search, moved: list[Any], acts: dynamics.Dynamics, found: Found, parts: _Parts) -> cbf.Barrier:
-    """ℓ of one constraint."""
-    content = _about(search, moved, found)
-    template = eqx.filter_eval_shape(blank_barrier, search.logged.map, parts.settings, found)
-    return parts.get("label", content, template, lambda key: _label(search, acts, parts.settings, found, key))
-
-
-def _about(search: _Search, moved: list[Any], found: Found) -> list[Any]:
-    """What a barrier is made of, beside its settings."""
-    return [*moved, _digest(search.logged.label), search.logged.map.names, found]
-
-
-def _with_future(label: cbf.Barrier, search: _Search, moved: list[Any], found: Found, parts: _Parts) -> cbf.Barrier:
-    """ℓ and V of one constraint."""
-    settings = parts.settings
-    logged = search.logged
-    steps = logged.fitted_steps
-
-    def fit(key: Key) -> cbf.Barrier:
-        return cbf.fit_future(
-            label,
-            logged.arrays,
-            steps,
-            steps[logged.close_to_danger()[steps]],
-            key,
-            discount=settings.future_discount,
-            expectile=settings.expectile,
-            updates=settings.future_updates,
-        )
-
-    template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
-    return parts.get("future", _about(search, moved, found), template, fit)
-
-
-def _label(search: _Search, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key) -> cbf.Barrier:
-    """ℓ of a data set, with the statistics that it reads by."""
-    logged = search.logged
-    key_states, key_fit = jax.random.split(key)
-    steps = logged.fitted_steps
-    unsafe = logged.unsafe[steps]
-    if unsafe.all() or not unsafe.any():
-        raise UserError(
-            f"All unsafe steps of '{logged.store.card.task}' lie in the episodes that are held out; log more of "
-            "them, or take another seed."
-        )
-    data = logged.arrays["features"], logged.predicted(acts), logged.arrays["row"], on_device(logged.label)
-    blank = _standardised(blank_barrier(logged.map, settings, found), logged, key_states)
-    if found.causes:
-        nets = fit_causes(
-            found,
-            search.result[1],
-            data,
-            steps[unsafe],
-            steps[~unsafe],
-            key_fit,
-            share=settings.predicted_share,
-            updates=settings.barrier_updates,
-            width=settings.barrier_width,
-        )
-        nets = margins.in_own_margins(nets, acts, logged, np.random.default_rng(0))
-        return dataclasses.replace(blank, causes=nets)
-    return cbf.fit_label(
-        blank,
-        data,
-        steps[unsafe],
-        steps[~unsafe],
-        key_fit,
-        loss=settings.loss,
-        penalty=settings.penalty,
-        share=settings.predicted_share,
-        updates=settings.barrier_updates,
-        width=settings.barrier_width,
-    )
+    return cbf.MinBarrier(each, names) if logged.several else each[0], causes
 
 
 def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier:
@@ -458,8 +432,7 @@ def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier
 def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
     if barrier is None:
         return "no barrier"
-    each = barrier.each if isinstance(barrier, cbf.MinBarrier) else (barrier,)
-    names = [net.cause.name for one in each for net in one.causes]
+    names = [net.cause.name for one in barrier.each for net in one.causes]
     if names:
         return f"a score for each cause ({'; '.join(names)}), the worst one counts"
     shape = barrier.shape
@@ -472,84 +445,3 @@ def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
         "one network per agent on all it sees; no names like other0.dx tell which entries belong to which other, so "
         "pairs could not be distinguished"
     )
-
-
-# --- the cache ---
-
-
-@dataclass(eq=False)
-class _Parts:
-    """Parts of a World, from the cache where they have been made of the same data, settings and seed."""
-
-    settings: Settings
-    seed: int
-    formula: dict[str, Any] | None  # the hazard that labels states
-    cached: bool
-    bar: Parts
-
-    def file(self, name: str, content: list[Any], of: Sequence[str] | None = None) -> Path:
-        """Where what depends on `content` and on the settings is kept: on those of the parts `of`, or on all."""
-        settings = dataclasses.asdict(self.settings)
-        formula = self.formula
-        if of is not None:
-            read = {"view", "execution", *(field for part in of for field in PARTS[part])}
-            settings = {field: value for field, value in settings.items() if field in read}
-            formula = formula if {"label", "future"} & set(of) else None
-        about = [FORMAT, name, content, settings, self.seed, formula]
-        written = msgspec.json.encode(about, enc_hook=np.ndarray.tolist, order="deterministic")
-        code = hashlib.sha256(written).hexdigest()[:16]
-        return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
-
-    def json(self, name: str, content: list[Any], kind: type[T], make: Callable[[], T]) -> T:
-        """What is found about a part before it is fitted, likewise."""
-        file = self.file(name, content, ["label"]).with_suffix(".json")
-        if self.cached and file.exists():
-            try:
-                return msgspec.json.decode(file.read_bytes(), type=kind)
-            except (OSError, msgspec.MsgspecError):
-                pass
-        with self.bar.part(name):
-            made = make()
-        if self.cached:
-            with whole(file) as temporary:
-                Path(temporary).write_bytes(msgspec.json.encode(made))
-        return made
-
-    def get(self, name: str, content: list[Any], template: T, make: Callable[[Key], T]) -> T:
-        """The part of that name; made, and then kept, where it is not there."""
-        file = self.file(name, content, [*UPON[name], name])
-        if self.cached and (kept := _read(file, template)) is not None:
-            self.bar.skip(name)
-            return kept
-        with self.bar.part(name):
-            made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
-        if self.cached:
-            save_named(file, named_arrays(made), {"key": file.stem})
-        return made
-
-
-def _read(file: Path, template: T) -> T | None:
-    """A cached part; None where there is none, a damaged one, or another's."""
-    if not file.exists():
-        return None
-    try:
-        with safe_open(file, "numpy") as opened:
-            key = (opened.metadata() or {}).get("key")
-        return load_named(file, template) if key == file.stem else None
-    except (SafetensorError, OSError, UserError):
-        return None
-
-
-def _kept_world(
-    file: Path, map: features.FeatureMap, store: EpisodeStore, settings: Settings, seed: int
-) -> World | None:
-    """A cached World; None likewise, and of one of other data, settings or seed, which somebody has put there."""
-    if not file.exists():
-        return None
-    try:
-        found = load(file, lambda *_: map)
-    except UserError:
-        return None
-    card = found.card
-    same = (card.data.content, card.settings, card.seed) == (store.card.content or store.content, settings, seed)
-    return found if same else None

@@ -9,7 +9,7 @@ have led, and the next begins where the log goes on. Of an unsafe step that is n
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,14 +52,14 @@ def count(logged: Logged, seed: int) -> int:
     return int(jumps.sum()) if jumps[into].sum() >= max(FEW, SHARE * len(into)) else 0
 
 
+@dataclass(frozen=True, eq=False)
 class Usual:
     """What own entries do in safe steps: a polynomial of own entries and action, for every agent."""
 
-    def __init__(self, own: np.ndarray, mean: np.ndarray, scale: np.ndarray, weights: np.ndarray):
-        self.own = own  # (F,) entries
-        self.mean = mean  # (N, F)
-        self.scale = scale
-        self.weights = weights  # (N, P, F)
+    own: np.ndarray  # (F,) entries
+    mean: np.ndarray  # (N, F)
+    scale: np.ndarray
+    weights: np.ndarray  # (N, P, F)
 
     @classmethod
     def of(cls, logged: Logged, steps: np.ndarray) -> Usual:
@@ -71,7 +71,7 @@ class Usual:
         x, changed = blank._read(logged, steps)
         x, changed = np.moveaxis(x, 1, 0), np.moveaxis(changed, 1, 0)
         squares = np.swapaxes(x, 1, 2) @ x + RIDGE * len(steps) * np.eye(x.shape[-1])
-        return cls(own, blank.mean, blank.scale, np.linalg.solve(squares, np.swapaxes(x, 1, 2) @ changed))
+        return replace(blank, weights=np.linalg.solve(squares, np.swapaxes(x, 1, 2) @ changed))
 
     def missed(self, logged: Logged, steps: np.ndarray) -> np.ndarray:
         """(W, N, F) by how much own entries change otherwise."""

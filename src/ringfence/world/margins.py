@@ -21,8 +21,7 @@ WINDOWS = 3000  # entries, and safe steps, that margins are read from
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 BEARABLE = 0.8  # share of safe steps that should have the margin
 OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
-AHEAD = (5, 7, 10, 15, 20, 30)  # steps ahead whose own margins are read
-FORESEEN = 1000  # entries that these are read from
+FARTHEST = 30  # steps that entries are predicted over by one program
 MISSED = 0.001  # share of entries that may look as safe as a cause's own margin
 
 
@@ -71,7 +70,7 @@ def count_entries(logged: Logged, bad: np.ndarray) -> int:
 
 def entered(logged: Logged, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(begins an episode, follows a safe step) of unsafe steps, each (W,) bool."""
-    row, first = (np.asarray(logged.arrays[name])[bad] for name in ("row", "first_row"))
+    row, first = (logged.picked(name, bad) for name in ("row", "first_row"))
     begins = row == first
     return begins, ~begins & ~logged.unsafe[np.maximum(bad - 1, 0)]
 
@@ -95,15 +94,15 @@ def scores_of_ends(
 
 def _begun(logged: Logged, ends: np.ndarray, back: int) -> np.ndarray:
     """(W,) bool: whether the episodes of steps had begun so many steps before."""
-    row, first = (np.asarray(logged.arrays[name])[ends] for name in ("row", "first_row"))
+    row, first = (logged.picked(name, ends) for name in ("row", "first_row"))
     return (ends >= back) & (row - back >= first)
 
 
 def _predicted(dynamics: Dynamics, logged: Logged, ends: np.ndarray, back: int) -> tuple[Array, Array]:
     """(before, after) of steps, each (W, N, D), as they are predicted from so many steps before; where the episode had
-    not `_begun`, nothing in particular. One program for all `back`, below the farthest of `AHEAD`."""
+    not `_begun`, nothing in particular. One program for all `back` below FARTHEST."""
     starts = np.maximum(ends - back, 0)
-    along = np.minimum(starts + np.arange(AHEAD[-1])[:, None], logged.store.steps - 1)
+    along = np.minimum(starts + np.arange(max(FARTHEST, back + 1))[:, None], logged.store.steps - 1)
     return _last_two(dynamics, logged.before(starts), logged.picked("actions", along), back + 1)
 
 
@@ -127,11 +126,11 @@ def _ends_and_safe(logged: Logged, count: int, rng: np.random.Generator) -> tupl
 
 
 def widening(
-    barrier: Barrier, dynamics: Dynamics, logged: Logged, rng: np.random.Generator
+    barrier: Barrier, dynamics: Dynamics, logged: Logged, rng: np.random.Generator, ahead: Sequence[int], count: int
 ) -> tuple[tuple[float, ...], ...]:
     """By cause, or once where there are none, how many margins more rows ahead ask for: by so much farther from danger
-    the steps that entered it looked, predicted from so many steps before."""
-    bad, fine = _ends_and_safe(logged, FORESEEN, rng)
+    the steps that entered it looked, predicted from so many steps before. Read at `ahead`, from `count` entries."""
+    bad, fine = _ends_and_safe(logged, count, rng)
     if not len(bad) or not len(fine):
         return ()
 
@@ -141,23 +140,21 @@ def widening(
     of_ends = scored(logged.before(bad), logged.after(bad))
     of_safe = scored(logged.before(fine), logged.after(fine))
     blamed = (of_ends.argmin(-1)[:, None] == np.arange(of_ends.shape[1])) & (of_ends < 1.0)
-    bearable = np.quantile(of_safe, 1 - BEARABLE, axis=0)
     asked = [np.zeros(of_ends.shape[1])]
-    for ahead in AHEAD:
-        known = _begun(logged, bad, ahead - 1)
+    for k in ahead:
+        known = _begun(logged, bad, k - 1)
         if known.sum() < ENTRIES:
             break
-        ends = scored(*_predicted(dynamics, logged, bad, ahead - 1))[known]
+        ends = scored(*_predicted(dynamics, logged, bad, k - 1))[known]
         wanted = asked[-1].copy()
-        for k in range(len(wanted)):
-            mine = ends[blamed[known, k], k]
+        for c in range(len(wanted)):
+            mine = ends[blamed[known, c], c]
             if len(mine) >= ENTRIES:
-                missed = max(MISSED, OUTLIERS / len(mine))
-                wanted[k] = max(wanted[k], min(conformal(mine, 1 - missed), bearable[k]) - 1.0)
+                wanted[c] = max(wanted[c], _own_margin(mine, of_safe[:, c]) - 1.0)
         asked.append(wanted)
-    at = np.array([JUDGED, *AHEAD][: len(asked)])
+    at = np.array([JUDGED, *ahead][: len(asked)])
     every = np.arange(1, at[-1] + 1)
-    found = [np.interp(every, at, np.array(asked)[:, k]) for k in range(of_ends.shape[1])]
+    found = [np.interp(every, at, np.array(asked)[:, c]) for c in range(of_ends.shape[1])]
     return tuple(tuple(round(float(w), 3) for w in one) for one in found)
 
 
@@ -184,7 +181,10 @@ def in_own_margins(
     for k, net in enumerate(nets):
         explained = by_each[:, k] < least_margin(net)  # no margin foresees the rest
         ends = bad[(blamed == k) & explained]
-        found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, stayed))
+        if len(ends):
+            predicted = scores_of_ends(lambda _, after, net=net: _least(net, after), dynamics, logged, ends)
+            net = with_margin(net, max(_own_margin(predicted, np.asarray(_least(net, stayed))), least_margin(net)))
+        found.append(net)
     return tuple(found)
 
 
@@ -194,10 +194,7 @@ def _least(net: Score, x: Array) -> Array:
     return lowest(worst([net], x))
 
 
-def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: np.ndarray) -> Score:
-    predicted = scores_of_ends(lambda _, after: _least(net, after), dynamics, logged, ends)
+def _own_margin(predicted: np.ndarray, safe: np.ndarray) -> float:
+    """The conformal margin of a cause's entries into danger; what cannot be foreseen is not bought by any."""
     missed = max(MISSED, OUTLIERS / len(predicted))
-    of_safe = np.asarray(_least(net, safe))
-    bearable = float(np.quantile(of_safe, 1 - BEARABLE))  # what cannot be foreseen is not bought by any margin
-    margin = min(conformal(predicted, 1 - missed), bearable)
-    return with_margin(net, max(margin, least_margin(net)))
+    return min(conformal(predicted, 1 - missed), float(np.quantile(safe, 1 - BEARABLE)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.problem.entries import Entries
 from ringfence.types import Array
-from ringfence.world import cause_candidates, cause_edges
+from ringfence.world import cause_candidates, cause_counts
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import UNKNOWN, Probe, ProbeMap
 from ringfence.world.cause_nets import Score
@@ -19,7 +19,6 @@ from ringfence.world.logged import Logged
 
 RADII = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)  # at which somebody is put
 INSIDE = 0.9  # of the radius: what is nearer has to be called unsafe
-STATES = 500  # held-out states that are asked about
 CLOSING = (0.0, 1.0)  # of the fastest closing that was seen
 POINTS = 25  # of a curve
 FARTHEST = 4.0  # radii, up to which the curve of a distance reaches
@@ -35,13 +34,14 @@ class Probed(NamedTuple):
     inside: float  # share of states with somebody inside the radius that are called unsafe
 
 
-def probe(barrier: Barrier | MinBarrier, logged: Logged, unit: float, rng: np.random.Generator) -> Probed:
-    """A barrier's answers, in margins of `unit`."""
-    each = barrier.each if isinstance(barrier, MinBarrier) else (barrier,)
-    nets = [net for one in each for net in one.causes]
+def probe(barrier: Barrier | MinBarrier, logged: Logged, unit: float, rng: np.random.Generator, count: int) -> Probed:
+    """A barrier's answers, in margins of `unit`, in so many states where held-out safe steps led."""
+    nets = [net for one in barrier.each for net in one.causes]
     curves = [_curve(net, unit) for net in nets if net.cause.width == 1]
     maps = [_map(net, unit) for net in nets if net.cause.width == 2]
-    states = _states(logged, rng)
+    held = logged.held_steps
+    fine = held[~logged.unsafe[held]]
+    states = logged.after(rng.choice(fine, min(count, len(fine)), replace=False))
     names = logged.map.names
     if not nets:
         curves += _own_speed(barrier, states, names, unit)
@@ -150,25 +150,12 @@ def _own_place(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequenc
 
 def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Edge]]:
     """How near things come: the causes that are a distance, or, of networks on all entries, what names tell of one."""
-    each = barrier.each if isinstance(barrier, MinBarrier) else (barrier,)
-    if any(one.causes for one in each):
-        return [(net.cause, net.edge) for one in each for net in one.causes if net.cause.is_distance]
-    return [(cause, _radius(cause, logged)) for cause in cause_candidates.offsets(logged.map.names)]
-
-
-def _radius(cause: Cause, logged: Logged) -> Edge:
+    nets = [net for one in barrier.each for net in one.causes]
+    if nets:
+        return [(net.cause, net.edge) for net in nets if net.cause.is_distance]
     steps = logged.fitted_steps
-    rows = np.asarray(logged.arrays["row"])[steps] + 1
-    x = logged.picked("features", rows)
-    return cause_edges.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
-
-
-def _states(logged: Logged, rng: np.random.Generator) -> np.ndarray:
-    """(W, N, D) where held-out safe steps led."""
-    held = logged.held_steps
-    fine = held[~logged.unsafe[held]]
-    fine = rng.choice(fine, min(STATES, len(fine)), replace=False)
-    return logged.after(fine)
+    told = logged.after(steps), logged.label[steps], logged.store.episode_of_step[steps]
+    return [(cause, cause_counts.radius(*told, cause)) for cause in cause_candidates.offsets(logged.map.names)]
 
 
 def _put(

@@ -9,7 +9,8 @@ from msgspec import Meta
 
 from ringfence.problem import features
 from ringfence.utils.config import Count, NonNegative, Share, Width
-from ringfence.world import barrier as cbf
+
+Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Settings:
     value_updates: Count = 8000  # of the critic, and again of rewards
     barrier: bool = True
     causes: bool = True  # find few entries that tell danger; where there are none, networks on all of them
-    loss: cbf.Loss = "cross-entropy"  # of labels
+    loss: Loss = "cross-entropy"  # of labels
     penalty: NonNegative = 1.0  # weight of the gradient's, where the loss has one
     predicted_share: Share = 0.5  # share of labelled steps that end where they were predicted to end
     distances: bool = True  # pairs read how far apart they are and how fast they close
@@ -38,3 +39,8 @@ class Settings:
     expectile: Annotated[float, Meta(ge=0.5, le=1)] = 0.7  # of what the logs did, how near to the best
     # share of unsafe steps that may be predicted at the default margin or above
     miscoverage: Annotated[float, Meta(ge=0, le=0.5)] = 0.001
+
+    @property
+    def alone(self) -> bool:
+        """Whether every agent has a World of its own, of what it sees itself."""
+        return self.execution == "decentralized"

@@ -23,6 +23,7 @@ from ringfence.problem.homogeneous import team_mean
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
+from ringfence.world.settings import Settings
 
 ROWS = 100_000  # states evaluated at once
 STATES = 20_000  # that features are standardised by, or up to twice as many
@@ -75,20 +76,14 @@ class Values(eqx.Module):
 
 
 def fit_values(
-    arrays: dict[str, Array],
-    picked: Array,
-    map: FeatureMap,
-    key: Key,
-    *,
-    discount: float,
-    updates: int,
-    period: int,
-    alone: bool = False,
+    arrays: dict[str, Array], picked: Array, map: FeatureMap, key: Key, settings: Settings, period: int
 ) -> Values:
     """Values of a data set's `arrays` (windows.py) by the steps in `picked` (K,); `period` as in `fit_critic`. Agents
     that are `alone` learn what each of them earns, (T, N) rewards and `returns_to_go`, the others what the team does,
     (T,)."""
     key_critic, key_reward, key_net = jax.random.split(key, 3)
+    alone = settings.alone
+    updates = settings.value_updates
     rewards = team_mean(arrays["rewards"], alone)
     seen, arrived, returns = _targets(arrays, rewards, picked)
     critic = fit_critic(seen, arrived, returns, key_critic, updates, period=period, weight=map.critic_weight)
@@ -106,7 +101,7 @@ def fit_values(
     data = arrays["features"], *(on_device(x) for x in some)
     label = "rewards, what steps are worth"
     reward = regress(loss, net, data, len(picked), key_reward, updates, BATCH, 4e-3, label)
-    return Values(critic, reward, discount, map.joint, alone)
+    return Values(critic, reward, settings.discount, map.joint, alone)
 
 
 def _targets(arrays: dict[str, Array], rewards: Array, picked: Array) -> tuple[Array, Array, Array]:

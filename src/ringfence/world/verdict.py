@@ -1,4 +1,5 @@
-"""Whether a World is fit to guard by, with its reasons and what helps."""
+"""What follows from the card of a World: whether it is fit to guard by, with its reasons and what helps, and how far
+guards look by themselves, by how well it predicts."""
 
 from __future__ import annotations
 
@@ -7,9 +8,11 @@ import re
 from collections.abc import Iterator
 from typing import Literal
 
+from msgspec.structs import replace
+
 from ringfence.errors import UserError
 from ringfence.logs.late import Lateness
-from ringfence.world.card import BarrierScores, Card, Verdict
+from ringfence.world.card import FARTHEST, JUDGED, Avoidable, BarrierScores, Card, Look, Verdict
 from ringfence.world.causes import Found
 
 Word = Literal["fit", "weak", "unfit"]
@@ -23,7 +26,18 @@ AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could 
 NOTHING = 1.0  # error of predictions as a share of what changes: to predict that nothing changes errs by as much
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
 UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
+LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V sees in time what they do not
+BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
+AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
 FORMULA = "give a formula of danger (hazard), e.g. where it is a sum or an area over the team"
+
+
+def decided(card: Card) -> Card:
+    """The card with its verdict, and with what guards are to look at."""
+    return replace(card, verdict=judge(card), look=look_of(card))
+
+
+# --- the verdict ---
 
 
 def judge(card: Card) -> Verdict:
@@ -151,3 +165,35 @@ def require_values(card: Card, anyway: bool = False) -> None:
         f"The World of '{card.data.task}' predicts returns-to-go worse than by their mean, and this guard climbs them; "
         "take guard='shield', log more episodes, or insist with anyway=True (--anyway)."
     )
+
+
+# --- how far guards look ---
+
+
+def look_of(card: Card) -> Look:
+    """What a guard is to look at, where a World is as its card says."""
+    rows = _rows_foreseen_well(card)
+    scores = card.barrier
+    if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
+        return Look(rows)
+    error = card.prediction_error
+    if error is not None and error.error_of_change[-1] <= BEARABLE:
+        return Look(rows, avoiding=min(scores.avoidable.rows, FARTHEST))
+    return Look(rows, terminal_value=scores.ahead_kept >= AHEAD_KEPT)
+
+
+def _rows_foreseen_well(card: Card) -> int:
+    """Rows, FARTHEST at most, for which all that the barrier reads is predicted well; margins widen along them."""
+    read = () if card.prediction_error is None else card.prediction_error.read
+    scores = [] if card.barrier is None else (card.constraints or {"": card.barrier}).values()
+    if not read or not scores or not all(one.widening for one in scores):  # those of before say nothing of rows ahead
+        return 0
+    well = [all(one.error[at] <= BEARABLE * one.deviation for one in read) for at in range(len(read[0].steps_ahead))]
+    return min(max((k for k, told in zip(read[0].steps_ahead, well) if told), default=0), FARTHEST)
+
+
+def _too_late(avoidable: Avoidable) -> bool:
+    """Whether the rows that a guard judges avoid little of the danger that could have been avoided, e.g. where braking
+    takes longer."""
+    seen = [share for before, share in zip(avoidable.before, avoidable.avoided) if before <= JUDGED]
+    return max(seen, default=0.0) < LITTLE * max(avoidable.avoided)
