@@ -28,7 +28,7 @@ from ringfence.problem.normalise import varying
 from ringfence.types import Key, Spec
 from ringfence.utils.cache import cache_dir
 from ringfence.utils.device import on_device
-from ringfence.utils.files import whole, writable
+from ringfence.utils.files import whole
 from ringfence.utils.progress import Parts
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
@@ -43,10 +43,10 @@ from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.look import look_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
-from ringfence.world.storage import blank_barrier, blank_world, load, save
+from ringfence.world.storage import blank_barrier, blank_world
 from ringfence.world.verdict import judge
 
-FORMAT = 6  # of what is fitted, found and told: what is cached of another is made again
+FORMAT = 6  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.95  # recall of causes, below which networks on all entries are tried, too
 STATES = 20_000  # steps that a barrier's features are standardised by
@@ -86,36 +86,14 @@ def fit_view(
     bar: Parts | None = None,
     search: Search | None = None,
 ) -> World:
-    """The World of a store in the view `map` of `spec`; from the cache where it has been fitted before.
+    """The World of a store in the view `map` of `spec`; its parts from the cache where they have been fitted before.
 
     `hazard`, bound to the view, labels states where `settings.labels` is "formula". A tenth of the episodes is held
     out of every part; the card says how good the World is on them, and by `search` what a guard would find in it.
     """
+    begun = time.perf_counter()
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached, bar or Parts("", (), quiet=True))
-    card = store.card  # `content` of agents who see for themselves is of the whole team's logs
-    told = [card.task, card.hazard, card.dt, card.content, card.action_delay, card.origins, _agents(store)]
-    file = parts.file("world", [store.content, features.to_dict(map), card.bounds, store.limits, *told])
-    if cached and (kept := _kept_world(file, map, store, settings, seed)) is not None:
-        return kept
-    if cached:
-        writable(file)
-    world = _fitted(store, map, spec, hazard, parts, search)
-    if cached:
-        save(world, file)
-    return world
-
-
-def _fitted(
-    store: EpisodeStore,
-    map: features.FeatureMap,
-    spec: Spec,
-    hazard: constraints.BoundHazard | None,
-    parts: _Parts,
-    search: Search | None,
-) -> World:
-    begun = time.perf_counter()
-    settings = parts.settings
     if settings.execution == "decentralized":
         map = features.alone(map)
     labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
@@ -477,6 +455,13 @@ def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
 # --- the cache ---
 
 
+def cached_file(name: str, about: list[Any]) -> Path:
+    """Where a part of a World, or the whole, is kept that follows from all that `about` tells."""
+    written = msgspec.json.encode([FORMAT, name, *about], enc_hook=np.ndarray.tolist, order="deterministic")
+    code = hashlib.sha256(written).hexdigest()[:16]
+    return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+
+
 @dataclass(eq=False)
 class _Parts:
     """Parts of a World, from the cache where they have been made of the same data, settings and seed."""
@@ -487,18 +472,12 @@ class _Parts:
     cached: bool
     bar: Parts
 
-    def file(self, name: str, content: list[Any], of: Sequence[str] | None = None) -> Path:
-        """Where what depends on `content` and on the settings is kept: on those of the parts `of`, or on all."""
-        settings = dataclasses.asdict(self.settings)
-        formula = self.formula
-        if of is not None:
-            read = {"view", "execution", *(field for part in of for field in PARTS[part])}
-            settings = {field: value for field, value in settings.items() if field in read}
-            formula = formula if {"label", "future"} & set(of) else None
-        about = [FORMAT, name, content, settings, self.seed, formula]
-        written = msgspec.json.encode(about, enc_hook=np.ndarray.tolist, order="deterministic")
-        code = hashlib.sha256(written).hexdigest()[:16]
-        return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+    def file(self, name: str, content: list[Any], of: Sequence[str]) -> Path:
+        """Where what depends on `content` and on the settings of the parts `of` is kept."""
+        read = {"view", "execution", *(field for part in of for field in PARTS[part])}
+        settings = {field: value for field, value in dataclasses.asdict(self.settings).items() if field in read}
+        formula = self.formula if {"label", "future"} & set(of) else None
+        return cached_file(name, [content, settings, self.seed, formula])
 
     def json(self, name: str, content: list[Any], kind: type[T], make: Callable[[], T]) -> T:
         """What is found about a part before it is fitted, likewise."""
@@ -538,18 +517,3 @@ def _read(file: Path, template: T) -> T | None:
         return load_named(file, template) if key == file.stem else None
     except (SafetensorError, OSError, UserError):
         return None
-
-
-def _kept_world(
-    file: Path, map: features.FeatureMap, store: EpisodeStore, settings: Settings, seed: int
-) -> World | None:
-    """A cached World; None likewise, and of one of other data, settings or seed, which somebody has put there."""
-    if not file.exists():
-        return None
-    try:
-        found = load(file, lambda *_: map)
-    except UserError:
-        return None
-    card = found.card
-    same = (card.data.content, card.settings, card.seed) == (store.card.content or store.content, settings, seed)
-    return found if same else None
