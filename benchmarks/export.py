@@ -25,6 +25,7 @@ from ringfence.datasets.make import make
 from ringfence.deploy import export
 from ringfence.evaluation import rollout
 from ringfence.loading.resolve import load
+from ringfence.training import worlds
 from ringfence.types import act_with
 
 OUT = RESULTS / "export.csv"
@@ -62,7 +63,7 @@ def main() -> None:
 
 def compared(run: Path, options: dict, seen: np.ndarray, whole_states: np.ndarray) -> dict:
     """One policy in both formats, beside the controller."""
-    job, policy = load(run, **options)
+    job, policy = worlds.with_world(load, run, **options)
     made = export.step_of(job, policy)
     play, row = {}, {}
     with tempfile.TemporaryDirectory() as folder:

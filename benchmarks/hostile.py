@@ -156,14 +156,14 @@ def checkpoints(place: Path, times: int) -> Iterator[Case]:
 
 
 def world_files(place: Path, times: int) -> Iterator[Case]:
-    from ringfence.world import save
+    from ringfence.world import load, save
 
     file = save(worlds.fit(corpus.small_store(), **QUICK_WORLD), place / "world.safetensors")
     raw = file.read_bytes()
     head = 8 + int.from_bytes(raw[:8], "little")
     for what, content in corpus.broken_bytes(raw, random.Random(times), 50 * times, head):
         file.write_bytes(content)
-        yield what, lambda: worlds.load(file), always
+        yield what, lambda: load(file), always
 
 
 def films(place: Path, times: int) -> Iterator[Case]:
@@ -234,7 +234,7 @@ def of_older_worlds(place: Path, times: int) -> Iterator[Case]:
     from safetensors import safe_open
     from safetensors.numpy import save_file
 
-    from ringfence.world import save
+    from ringfence.world import load, save
 
     file = save(worlds.fit(corpus.small_store(), **QUICK_WORLD), place / "world.safetensors")
     with safe_open(file, "numpy") as opened:
@@ -245,13 +245,13 @@ def of_older_worlds(place: Path, times: int) -> Iterator[Case]:
     for place_of, junk in ((p, j) for p in corpus.places(about, 4) for j in rng.sample(corpus.JUNK, 2 * times)):
         words = corpus.with_junk(about, place_of, junk).decode()
         save_file(arrays, file, {"ringfence_world": words})
-        yield f"{place_of} is {junk!r:.20}", lambda: worlds.load(file), lambda world: str(world.card) is not None
+        yield f"{place_of} is {junk!r:.20}", lambda: load(file), lambda world: str(world.card) is not None
     for name, array in arrays.items():
         for what, other in (("NaN", array * np.nan), ("shorter", array.ravel()[:-1]), ("words", array.astype("S1"))):
             with contextlib.suppress(Exception):  # what safetensors itself cannot write
                 save_file(arrays | {name: np.ascontiguousarray(other)}, file, {"ringfence_world": json.dumps(about)})
                 empty = array.size == 0
-                yield f"{name} {what}", lambda: worlds.load(file), lambda _, empty=empty: empty
+                yield f"{name} {what}", lambda: load(file), lambda _, empty=empty: empty
 
 
 def of_simulators(place: Path, times: int) -> Iterator[Case]:

@@ -28,6 +28,7 @@ from ringfence.datasets.task import Task
 from ringfence.envs import SafeMuJoCo
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.logs.store import EpisodeStore
+from ringfence.training import worlds
 from ringfence.training.runs import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "results" / "planner"
@@ -187,7 +188,7 @@ def parameters(run: Run) -> int:
 
 def played(run: Any, task: Task, options: dict[str, Any]) -> dict[str, Any]:
     begun = time.monotonic()
-    r = evaluate(run, episodes=episodes_of(task), **options)
+    r = worlds.with_world(evaluate, run, episodes=episodes_of(task), **options)
     of = r["per_episode"]
     return {
         "options": options,

@@ -171,7 +171,7 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
     )
     given = options
     if "barrier_guidance" in options or "guard" in options:
-        given = options | {"world": worlds.fit(store, task=task)}  # the same for all seeds
+        given = options | {"world": worlds.fit(store)}  # the same for all seeds
         given |= {"anyway": True} if "guard" in options else {}
     episodes = episodes_of(task)
     results = [evaluate(run, episodes=episodes, **given) for run in trained]

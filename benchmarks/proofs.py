@@ -22,9 +22,9 @@ from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS
 from ringfence.deploy import zoo
 from ringfence.evaluation.stress import stress
-from ringfence.loading import run_worlds
 from ringfence.nets.bounds import Inputs, output_bounds
 from ringfence.nets.mlp import MLP
+from ringfence.training import worlds
 
 RUN = "crossing-hasty/bc"
 KEPT = ("return_mean", "violation_rate", "violation_upper", "infeasible_rate", "proved_rate", "agent_proved_rate")
@@ -83,7 +83,7 @@ def compared(net: MLP, centers: jax.Array, radius: float) -> dict:
 
 
 def bounds(run) -> None:
-    world = run_worlds.of_run(run)
+    world = worlds.of_run(run)
     store, _ = make(TASKS["crossing-hasty"])
     steps = np.random.default_rng(0).choice(store.steps, BOXES, replace=False)
     row = steps + store.episode_of_step[steps]

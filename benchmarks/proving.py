@@ -164,7 +164,7 @@ def played(run, row: str, options: dict, episodes: int) -> dict:
         policy = CbfQp(resolved.team, task.env)
         found, _ = evaluate_policy(policy, task, episodes, "test", run.config["seed"])
     else:
-        found = evaluate(run, episodes=episodes, **options)
+        found = worlds.with_world(evaluate, run, episodes=episodes, **options)
     kept = {"episodes": episodes} | {name: found[name] for name in COLUMNS if name in found}
     return kept | {"seconds": round(time.perf_counter() - begun, 1)}
 

@@ -148,7 +148,7 @@ def one(job: tuple) -> dict:
     from ringfence.datasets import registry
     from ringfence.datasets.make import make
     from ringfence.evaluation.evaluate import evaluate
-    from ringfence.training import loop
+    from ringfence.training import loop, worlds
 
     task = registry.get(study.task)
     store, _ = make(task)
@@ -171,7 +171,8 @@ def one(job: tuple) -> dict:
             quiet=True,
         )
         seconds = time.perf_counter() - begun
-        r = evaluate(run, episodes=study.episodes, split="validation", planner=played, **guard)
+        how = {"episodes": study.episodes, "split": "validation", "planner": played, **guard}
+        r = worlds.with_world(evaluate, run, **how)
     told = (algorithm, preset, number, json.dumps(changes), study.name, SEED, r["split"], r["episodes"])
     numbers = (round(r["return_mean"], 2), *(round(r[k], 4) for k in ("return_norm", "cost_mean", "cost_safe_start")))
     return dict(zip(FIELDS, (*told, *numbers, round(seconds, 1))))

@@ -262,7 +262,7 @@ def prepared(name: str, task: Task, store: EpisodeStore) -> tuple[Any, Any, Any,
     """A job, its windows, its state stacked for one seed, and the World that it reads."""
     quick = {f"{part}_updates": 10 for part in ("dynamics", "value", "barrier", "future")}
     job = make_job(name, task, None, {}, store, *([quick] if name == "icbf" else []))
-    read = [worlds.fit(store, task=task, **job.world)] if name == "icbf" else []
+    read = [worlds.fit(store, **job.world)] if name == "icbf" else []
     data = loop.windows_of(job, store, *read)
     state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.feature_map, job.hazard, *read)
     return job, data, jax.tree.map(lambda x: x[None], state), (read or [None])[0]
@@ -437,7 +437,8 @@ def board(folder: Path, task: str = "simple_spread-expert") -> None:
         for variant, result in run.results.items():
             how = {k: result[k] for k in ("guard", "barrier", "execution")} | result["guard_options"]
             how = how if result.get("guard", "none") != "none" else {}
-            took = plan_latency(load(run, **result["options"], **how)[1], registry.get(task))
+            policy = worlds.with_world(load, run, **result["options"], **how)[1]
+            took = plan_latency(policy, registry.get(task))
             run.add_result(variant, result | took)
             print(f"{cell.parent.name} {variant}: {took['plan_ms_p50']:.2f} ms, p99 {took['plan_ms_p99']:.2f}")
 

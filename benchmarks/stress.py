@@ -134,6 +134,7 @@ def play_system(folder: Path, guard: str, episodes: int, out: Path) -> None:
     from ringfence.evaluation.stress import stress
     from ringfence.faults import Faults
     from ringfence.training.runs import Run
+    from ringfence.training.worlds import with_world
 
     run = Run.of(folder) if folder.exists() else zoo.pretrained(str(folder), tempfile.mkdtemp())
     guarded = {"guard": guard, "anyway": True}
@@ -144,7 +145,7 @@ def play_system(folder: Path, guard: str, episodes: int, out: Path) -> None:
             unknown = "compensate" in options and not known_to_guards(Faults.of(faults))
             if unknown or not missing(out, row):
                 continue
-            result = stress(run, faults, episodes=episodes, **options)
+            result = with_world(stress, run, faults, episodes=episodes, **options)
             row |= {"return": round(result["return_mean"], 3), "cost": round(result["cost_mean"], 3)}
             append(out, row | {k: round(result[k], 4) if k in result else "" for k in RATES})
 

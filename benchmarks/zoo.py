@@ -17,7 +17,6 @@ from common import RESULTS, read, write
 
 from ringfence.deploy import zoo
 from ringfence.evaluation.evaluate import evaluate
-from ringfence.loading import run_worlds
 from ringfence.training import worlds
 from ringfence.training.runs import Run
 
@@ -45,8 +44,8 @@ def main() -> None:
     for name, cell in CELLS.items():
         task = name.split("/")[0]
         for run in (Run(p) for f in folders for p in (f / "cells" / task / cell).glob("seed-0-*")):
-            own = run_worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
-            print(*zoo.put(run, name, own, run_worlds.for_guard(run)))
+            own = worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
+            print(*zoo.put(run, name, own, worlds.fit_run(run)))
             for guard in ("none", GUARDS[task]):
                 found = [r for r in run.results.values() if _is(r, guard)]
                 before[name, guard] = {
@@ -57,8 +56,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as there:
         for task in given.fit:
             run = zoo.pretrained(f"{task}/bc", there)
-            alone = run.config["spec"].get("homogeneous", False)
-            guards = run_worlds.of_data(run, "decentralized" if alone else "centralized")
+            for there_already in (worlds.GUARD, worlds.WORLD):
+                (run.path / there_already).unlink(missing_ok=True)
+            guards = worlds.fit_run(run)
             print(zoo.renew(task, guards, [name.split("/")[1] for name in READERS if name.startswith(task)]))
             for name in CELLS:  # what was played before was under another guard
                 before.pop((name, GUARDS[task]), None)

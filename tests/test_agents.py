@@ -108,7 +108,7 @@ def test_agents_in_another_order_are_refused_at_run_time(pair, tmp_path):
     swapped = pair.card.agents[::-1]
     wrong = "Agent 0 is robot_10 here and robot_9 in the logs; bring all into the logs' order: robot_9, robot_10"
     world = worlds.fit(pair, **QUICK_WORLD)
-    assert worlds.load(world_files.save(world, tmp_path / "w.safetensors")).card.data.agents == pair.card.agents
+    assert world_files.load(world_files.save(world, tmp_path / "w.safetensors")).card.data.agents == pair.card.agents
     run = loop.train("bc", pair, out=tmp_path, changes={"num_updates": 2, "width": 8}, quiet=True)[0]
     for controller in (Controller(run), ringfence.guard(lambda o: np.zeros((2, 2)), world, guard="none")):
         assert controller.agents == pair.card.agents

@@ -140,7 +140,7 @@ def test_every_constraint_has_a_barrier(logs, fitted, tmp_path):
     card = str(fitted.card)
     assert "Constraint 'wall', at most 0 per episode" in card and "Constraint 'fast', at most 10" in card
     assert min(scores.recall for scores in fitted.card.constraints.values()) > 0.9
-    loaded = worlds.load(world.save(fitted, tmp_path / "w.safetensors"))
+    loaded = world.load(world.save(fitted, tmp_path / "w.safetensors"))
     np.testing.assert_array_equal(loaded.barrier.apart(x, x), fitted.barrier.apart(x, x))
     assert loaded.limits == LIMITS
 

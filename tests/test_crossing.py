@@ -23,6 +23,7 @@ from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import unsafe_starts
 from ringfence.training import loop, worlds
+from ringfence.world import load as load_world
 from ringfence.world import save
 from ringfence.world.logged import held_out
 from tests.quick import QUICK_WORLD, Compiled
@@ -283,7 +284,7 @@ def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     world = worlds.fit(mine, **QUICK_WORLD)
     assert world.map.decentralized and world.map.dt == pytest.approx(0.1)  # as names and steps tell
     assert world.map.own == Crossing().feature_map("pruned").own
-    world = worlds.load(save(world, tmp_path / "fleet.world"))
+    world = load_world(save(world, tmp_path / "fleet.world"))
     assert world.map.decentralized
     seen = np.asarray(logs.observations[40, :5])
     pilot = Controller(run, guard="shield", world=world, agents=5)

@@ -25,6 +25,7 @@ from ringfence.proposals.guidance import guided
 from ringfence.proposals.options import PlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.types import Spec, act_with
+from ringfence.world import load as load_world
 from tests.quick import QUICK_WORLD
 
 EPISODES, LENGTH = 200, 10
@@ -348,7 +349,7 @@ def test_plans_are_guided_to_the_margin(two_drifts, tmp_path, caplog):
     told = [
         metadata_of(resolve(PolicySpec.of(run, **how)), step) for how in ({}, {"barrier_guidance": 1.0, "anyway": True})
     ]
-    digests = [None, digest(worlds.load(run.path / worlds.WORLD))]
+    digests = [None, digest(load_world(run.path / worlds.WORLD))]
     assert [(one["guiding_world"], one["world"]) for one in told] == [(one, None) for one in digests]
 
 

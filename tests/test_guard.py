@@ -20,7 +20,6 @@ from ringfence.guards.correction import ASKED, Corrector, continuations, fixed_p
 from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
 from ringfence.guards.shown import Shown
-from ringfence.loading import run_worlds
 from ringfence.loading.resolve import load
 from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
@@ -416,7 +415,7 @@ def test_a_world_of_other_data_is_refused(small_store, small_world, tmp_path):
     run = loop.train("bc", small_store, **tiny)[0]
     data = msgspec.structs.replace(small_world.card.data, task="other")
     other = dataclasses.replace(small_world, card=msgspec.structs.replace(small_world.card, data=data))
-    with pytest.raises(UserError, match="The World is of 'other', the run .* of other data"):
+    with pytest.raises(UserError, match="is a World of 'other', the run .* of other data"):
         load(run, guard="shield", world=other)
     with pytest.raises(UserError, match="needs the World of its data"):
         load(run, guard="shield")  # nothing that this package regenerates
@@ -448,12 +447,12 @@ def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_p
         )[0]
         for d in (0.8, 0.9)
     )
-    assert run_worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
-    monkeypatch.setattr(run_worlds, "_made_here", lambda run: True)
-    monkeypatch.setattr(run_worlds, "of_data", lambda run, execution, quiet: "the task's")
-    assert run_worlds.for_guard(far) == "the task's"
-    assert run_worlds.for_guard(usual).values.discount == 0.9
-    assert run_worlds.of_run(far).values.discount == 0.8
+    assert worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
+    monkeypatch.setattr(worlds, "_made_here", lambda run: True)
+    monkeypatch.setattr(worlds, "_in_cache", lambda *_: "the task's")
+    assert worlds.for_guard(far) == "the task's"
+    assert worlds.for_guard(usual).values.discount == 0.9
+    assert worlds.of_run(far).values.discount == 0.8
 
 
 def test_one_controller_for_a_run_or_a_callable(small_world, tmp_path):

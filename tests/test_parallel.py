@@ -32,6 +32,7 @@ from ringfence.logs.collect import collect
 from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 from ringfence.utils.progress import Progress
+from ringfence.world import load as load_world
 from ringfence.world import save
 from tests.quick import QUICK_WORLD
 
@@ -390,7 +391,7 @@ def test_a_world_that_reads_observations_and_the_state(tmp_path):
     world = worlds.fit(store, **QUICK_WORLD)
     assert world.map.reads == ("observations", "state") and world.map.width > max(world.widths)
     save(world, tmp_path / "kept.world")
-    kept = worlds.load(tmp_path / "kept.world")
+    kept = load_world(tmp_path / "kept.world")
     run = loop.train("bc", store, out=tmp_path, changes=TINY, quiet=True)[0]
     cheap = {"horizon": 1, "correction_steps": 1, "correction_restarts": 0}
     assert play(run, SimpleSpreadParallel, episodes=2, guard="shield", world=kept, **cheap)["episodes"] == 2

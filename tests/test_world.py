@@ -17,7 +17,6 @@ from ringfence.datasets import registry
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.guards.wrap import Nothing
-from ringfence.loading import run_worlds
 from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
@@ -35,14 +34,14 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
     """From the cache the second time, to the last bit; and from a file of its own."""
     monkeypatch.setattr("ringfence.world.dynamics.regress", lambda *_, **__: pytest.fail("it was fitted again"))
     again = worlds.fit(small_store, **QUICK_WORLD)
-    loaded = worlds.load(world.save(small_world, tmp_path / "w.safetensors"))
+    loaded = world.load(world.save(small_world, tmp_path / "w.safetensors"))
     for other in (again, loaded):
         for a, b in zip(jax.tree.leaves(small_world), jax.tree.leaves(other), strict=True):
             np.testing.assert_array_equal(a, b)
     assert loaded.card.seed == 0 and str(loaded.card) == str(small_world.card)
     (tmp_path / "w.safetensors").write_bytes(b"none")
     with pytest.raises(UserError, match="is no World that can be read"):
-        worlds.load(tmp_path / "w.safetensors")
+        world.load(tmp_path / "w.safetensors")
 
 
 def test_a_world_of_other_data_in_the_cache_is_not_taken(small_store, tmp_path, monkeypatch):
@@ -66,14 +65,15 @@ def test_a_world_of_other_data_in_the_cache_is_not_taken(small_store, tmp_path, 
 def test_a_world_of_other_data_in_a_run_is_refused(small_store, small_world, tmp_path):
     """Though its task is called the same, and its agents act alike."""
     world.save(small_world, tmp_path / "guard.safetensors")
-    config = {"task": small_store.card.task, "seed": 0, "spec": {"action_dim": 2}}
+    card = worlds.card_of(small_store)
+    config = {"task": card["task"], "seed": 0, "spec": {"action_dim": 2}, "hazard": card["hazard"]}
     mine, others = (
-        types.SimpleNamespace(path=tmp_path, config=config | {"data": {"content": content}})
+        types.SimpleNamespace(path=tmp_path, config=config | {"data": card | {"content": content}})
         for content in (small_store.content, "another")
     )
-    assert run_worlds.for_guard(mine, "centralized").card == small_world.card
-    with pytest.raises(UserError, match="is a World of '.*', the run is of other data"):
-        run_worlds.for_guard(others, "centralized")
+    assert worlds.for_guard(mine, "centralized").card == small_world.card
+    with pytest.raises(UserError, match="is a World of '.*', the run '.*' of other data"):
+        worlds.for_guard(others, "centralized")
 
 
 @pytest.mark.parametrize("change", [{"miscoverage": 2}, {"miscoverage": -1}, {"miscoverage": "nan"}, {"discount": 1.5}])
@@ -121,7 +121,7 @@ def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):
         return guarded.initial_state(1)
 
     for _ in range(2):
-        loaded = worlds.load(file)
+        loaded = world.load(file)
         start(guards.policy.build(Nothing(), loaded, constraints.Separation(), "shield", "both"))
     assert len(traced) == 1
     others = [dataclasses.replace(loaded.map, view="other"), dataclasses.replace(loaded.map, plus=loaded.map.plus + 1)]

@@ -11,16 +11,16 @@ from ringfence.cli import app
 from ringfence.deploy import zoo
 from ringfence.deploy.controller import Controller
 from ringfence.errors import UserError
-from ringfence.loading import run_worlds
 from ringfence.loading.resolve import load
-from ringfence.training import loop
+from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 
 
 @pytest.mark.parametrize("name", zoo.names())
 def test_every_one_is_loaded_with_the_world_that_guards_it(name, tmp_path, monkeypatch):
     """Nothing is regenerated, fitted or trained for it."""
-    monkeypatch.setattr(run_worlds, "of_data", lambda *_: pytest.fail("asked for its data"))
+    for maker in ("make", "fit"):
+        monkeypatch.setattr(worlds, maker, lambda *_, **__: pytest.fail("made or fitted something"))
     run = zoo.pretrained(name, tmp_path)
     job, policy = load(run, guard="shield")
     assert (job.task.name, job.algorithm.name) == tuple(name.split("/"))
@@ -48,7 +48,7 @@ def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
         for r in (run, back)
     )
     np.testing.assert_allclose(now.act(seen, state), was.act(seen, state), atol=0.02)
-    assert run_worlds.of_run(back).ood_threshold == 2 * run_worlds.for_guard(back).ood_threshold
+    assert worlds.of_run(back).ood_threshold == 2 * worlds.for_guard(back).ood_threshold
     assert back.checkpoints()[0][0] == 4 and back.config == run.config
 
 

@@ -54,6 +54,16 @@ class CheckpointError(UserError):
     """A checkpoint is truncated, foreign or incomplete."""
 
 
+class NoWorld(UserError):
+    """A run is to be played with a World that is nowhere, and whose data this package can make again. `execution` is
+    that of the World."""
+
+    def __init__(self, message: str, folder: Path, execution: str):
+        super().__init__(message)
+        self.folder = folder
+        self.execution = execution
+
+
 class RunConflict(UserError):
     """A run folder holds another job than the one that is to be trained there."""
 

@@ -437,9 +437,9 @@ class _Group:
             num_recorded = 4 if cell.seed == 0 else 0
             # A benchmark measures what an unfit World is worth, too.
             spec = replace(PolicySpec.parse(name, run), anyway=True)
-            evaluate_spec(spec, episodes=self.episodes, num_recorded=num_recorded)
+            worlds.with_world(evaluate_spec, spec, episodes=self.episodes, num_recorded=num_recorded)
         for trial in cell.missing_trials(self.out, self.episodes):
-            trial.play(run, self.episodes)
+            worlds.with_world(trial.play, run, self.episodes)
         played = time.perf_counter() - self.begun - trained
         _record(cell, self.out, "done", self._took(cell, trained, played))
         self.tell("done", self.left.pop(0))

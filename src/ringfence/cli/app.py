@@ -105,21 +105,21 @@ UNFIT = 3  # exit status of a fit whose World is unfit to guard by
 
 def fit(
     data: Positional[str],
-    seed: int = 0,
+    seed: int | None = None,
     execution: Literal["centralized", "decentralized"] | None = None,
     set: Assignments = [],  # noqa: B006
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     report: Path | None = None,
 ) -> None:
-    """Fit the World of a task's data or of a store, and print its card: what can be predicted, how well, where not. The
-    last line is the verdict; exit status 3 says that it is unfit to guard by.
+    """Fit the World of a task's data, of a store or of a run, and print its card: what can be predicted, how well,
+    where not. The last line is the verdict; exit status 3 says that it is unfit to guard by.
 
     Cached by content: the same data, settings and seed are fitted once, and an interrupted fit goes on with the part
-    that it was at.
+    that it was at. The World that guards a run has its seed and its task's settings, and is kept in its folder.
 
     Args:
-        data: a task (its data set is regenerated if need be) or a store's file.
-        seed: of the fit, and of which episodes are held out.
+        data: a task (its data set is regenerated if need be), a store's file, or the folder of a run of such a task.
+        seed: of the fit, and of which episodes are held out; 0 by default.
         execution: centralized for guards that see the team (default), decentralized for agents that each guard their
             own action by their own view (always so of homogeneous agents).
         set: settings of the World, e.g. --set barrier_updates=3000 labels=formula.
@@ -127,18 +127,28 @@ def fit(
         report: write the card as an HTML page: are these logs enough?
     """
     from ringfence import world
+    from ringfence.datasets import registry
     from ringfence.training import worlds
 
     report = None if report is None else writable(report)
     out_file = None if out_file is None else writable(out_file)
     settings: dict[str, Any] = dict(assignments(set))
-    worlds.check(seed, settings)
-    store = _store(data)
-    made = worlds.fit(store, seed=seed, execution=execution, quiet=False, **settings)
+    store = None
+    if data not in registry.TASKS and Path(data).is_dir():
+        for name, value in {"seed": seed, "set": settings or None, "report": report}.items():
+            if value is not None:
+                raise UserError(
+                    f"--{name} is for data, and '{data}' is a run's folder; leave it out, or give its data."
+                )
+        made = worlds.fit_run(_one_run(Path(data)), execution=execution, quiet=False)
+    else:
+        seed = worlds.check(seed or 0, settings)
+        store = _store(data)
+        made = worlds.fit(store, seed=seed, execution=execution, quiet=False, **settings)
     out.print(lines(str(made.card)), soft_wrap=True)
     if out_file is not None:
         print(world.save(made, out_file))
-    if report is not None:
+    if report is not None and store is not None:
         from ringfence.datasets.audit import audit
         from ringfence.report.ope_page import build_ope
 
@@ -167,6 +177,7 @@ def evaluate(
         video: make a GIF of the first episode (robots).
     """
     from ringfence.evaluation.evaluate import evaluate as run_evaluation
+    from ringfence.training.worlds import with_world
 
     given = playing.arguments()
     found = _some_runs(runs)
@@ -199,7 +210,7 @@ def evaluate(
     refusals = Refusals()
     for run in found:
         with refusals.of(run):
-            result = run_evaluation(run, **given)
+            result = with_world(run_evaluation, run, **given)
             table.add_row(*_evaluated(run, result))
             doubts += _doubt(result)
             if video:
@@ -273,6 +284,7 @@ def play(
     """
     from ringfence.evaluation.play import play as run_play
     from ringfence.evaluation.simulators import simulator
+    from ringfence.training.worlds import with_world
 
     given = playing.arguments()
     faults = wrong.faults()
@@ -293,7 +305,7 @@ def play(
     for run in found:
         with refusals.of(run):
             try:
-                table.add_row(*_played(run, run_play(run, make, **given)))
+                table.add_row(*_played(run, with_world(run_play, run, make, **given)))
             except Interrupted as stopped:
                 if stopped.finished:
                     table.add_row(*_played(run, stopped.finished))
@@ -354,6 +366,7 @@ def stress(
     """
     from ringfence.evaluation.simulators import simulator
     from ringfence.evaluation.stress import stress as run_stress
+    from ringfence.training.worlds import with_world
 
     faults = wrong.faults()
     given = playing.arguments()
@@ -372,7 +385,7 @@ def stress(
     shown = "\n".join(f"{name} {value}" for name, value in faults.given.items()) or "none"
     for run in found:
         with refusals.of(run):
-            first, *rest = _played(run, run_stress(run, faults, **given))
+            first, *rest = _played(run, with_world(run_stress, run, faults, **given))
             table.add_row(first, shown, *rest)
     _say(table, refusals, len(found))
 
@@ -408,6 +421,7 @@ def certify(
     """
     from ringfence.evaluation.certify import certify as run_certify
     from ringfence.evaluation.simulators import simulator
+    from ringfence.training.worlds import with_world
 
     faults = wrong.faults()
     given = playing.arguments()
@@ -418,7 +432,7 @@ def certify(
     given |= {"confidence": confidence, "quantile": quantile, "calibration": calibration, "episodes": episodes}
     given |= replaying.arguments() | {"logs": None if logs is None else _store(logs)}
     given |= {"make_env": None if env is None else simulator(env)}
-    made = run_certify(found, faults, quiet=False, **given)
+    made = with_world(run_certify, found, faults, quiet=False, **given)
     for line in made.summary():
         out.print(lines(line), soft_wrap=True)
     print(made.save(file))
@@ -472,8 +486,10 @@ def export(
     """
     given = playing.arguments()
     from ringfence.deploy.export import export as write
+    from ringfence.training.worlds import with_world
 
-    print(write(_one_run(run), out_file, format, checkpoint, quiet=False, **given))
+    found = _one_run(run)
+    print(with_world(write, found, out_file, format, checkpoint, quiet=False, **given))
 
 
 def ope(
@@ -509,7 +525,7 @@ def ope(
     sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
     evaluation.check_sizes(**sizes)
     store = _store(data)
-    result = evaluation.ope(found, store, quiet=False, **sizes, **given)
+    result = worlds.with_world(evaluation.ope, found, store, quiet=False, **sizes, **given)
     for line in result.summary():
         out.print(lines(line), soft_wrap=True)
     if report is not None:
@@ -545,6 +561,7 @@ def replay(
     from ringfence.evaluation.replay import replay as replayed
     from ringfence.report.replay_page import build_replay
     from ringfence.training.runs import write_json
+    from ringfence.training.worlds import with_world
 
     given: dict[str, Any] = {**playing.arguments(), "faults": wrong.faults(), "compensate": compensate}
     out_file = None if out_file is None else writable(out_file)
@@ -553,7 +570,7 @@ def replay(
     if policy is None:
         given["world"] = playing.world or run
     given |= replaying.arguments() | {"windows": windows, "seed": seed, "quiet": False}
-    result = replayed(policy, _store(data), **given)
+    result = with_world(replayed, policy, _store(data), **given)
     for line in result.summary():
         out.print(lines(line), soft_wrap=True)
     if out_file is not None:

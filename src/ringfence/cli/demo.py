@@ -14,9 +14,8 @@ from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.evaluation import reference
 from ringfence.evaluation.evaluate import evaluate
-from ringfence.loading import run_worlds
 from ringfence.report import build_report
-from ringfence.training import loop
+from ringfence.training import loop, worlds
 
 
 def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
@@ -36,7 +35,7 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     protocol: dict[str, Any] = {"episodes": episodes, "num_recorded": 4, "quiet": False}
     fewer: dict[str, Any] = {"sampling_steps": 2} if quick else {}
     learned: dict[str, Any] = {"barrier": "learned", "anyway": quick}  # so little training is unfit to guard by
-    world = run_worlds.of_run(planner)
+    world = worlds.of_run(planner)
     console.print(str(world.card), soft_wrap=True, markup=False)
     rows["BC"] = evaluate(cloned, **protocol)
     rows["BC, shielded, formula"] = evaluate(cloned, guard="shield", barrier="analytic", world=world, **protocol)

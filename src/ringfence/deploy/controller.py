@@ -24,7 +24,6 @@ from ringfence.loading.resolve import load
 from ringfence.problem.constraints import Hazard
 from ringfence.problem.homogeneous import PerAgent, team_policy
 from ringfence.proposals.options import DEFAULT
-from ringfence.training import worlds
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree, act_with, with_cost
@@ -32,6 +31,7 @@ from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import given_as, refuse_other_order
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
+from ringfence.world import load as load_world
 
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (N, O) and state (S,) of one environment
 OneCost = np.ndarray | dict[str, np.ndarray]  # (1,), or that by constraint
@@ -345,7 +345,7 @@ def _source(run: Any, planner: str, options: dict[str, Any]) -> _TrainedRun | _F
     world = options.pop("world", None)
     if world is None:
         raise UserError("A callable acts under guard alone; give world=, the World that its guard reads.")
-    found = in_float32(under_guard)(run, worlds.load(world) if isinstance(world, str | Path) else world, **options)
+    found = in_float32(under_guard)(run, load_world(world) if isinstance(world, str | Path) else world, **options)
     assert isinstance(found, Callback)  # of whatever is no policy of the library
     return _Function(found)
 

@@ -15,7 +15,7 @@ from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown
 from ringfence.guards import Guard, Guarded, options_of
 from ringfence.guards.policy import build
-from ringfence.loading import oracle, run_worlds
+from ringfence.loading import oracle
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
@@ -82,10 +82,9 @@ def load(run: Run | str, checkpoint: int | None = None, planner: str = "default"
     `planner` is a named set of options of those who draw plans (proposals.options.PLANNERS), `guard` one of guards
     (guards.GUARDS), `barrier` what the guard knows danger by, `execution` whether it sees the whole team
     ("centralized") or every agent guards its own action by its own view ("decentralized", the only one of homogeneous
-    agents), `world` the World it
-    reads (default: that of the run's data and seed), `agents` how many play, where they are homogeneous. Other options
-    are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
-    `Controller`.
+    agents), `world` the World it reads (default: that of the run's data and seed, which `fit_run` makes where there is
+    none), `agents` how many play, where they are homogeneous. Other options are fields of PlanOptions and GuardOptions.
+    The policy's `act` is a pure function: compile it with jax.jit, or use a `Controller`.
     """
     found = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     return found.job, found.team
@@ -93,12 +92,12 @@ def load(run: Run | str, checkpoint: int | None = None, planner: str = "default"
 
 @in_float32
 def resolve(spec: PolicySpec) -> Resolved:
-    """The policy that a spec names. Only this may read a World, or make one again from regenerated data."""
+    """The policy that a spec names. This reads Worlds and makes none: `NoWorld` where there is none."""
     if spec.run is None:
         raise UserError("This spec names no run; give one that `ringfence train` made.")
     run = spec.run
     job = load_job(run, spec.agents)
-    world = run_worlds.of_run(run) if job.reads_world else None
+    world = worlds.of_run(run) if job.reads_world else None
     step, policy = _trained(run, job, world, spec)
     plans = isinstance(policy, TakesPlanOptions)
     if not plans:
@@ -109,8 +108,7 @@ def resolve(spec: PolicySpec) -> Resolved:
         team = team_policy(policy, job.team, job.task.homogeneous)
         policy = oracle.guarded(team, job.task, spec.guard, dict(spec.guard_options))
     elif spec.guarded:
-        execution = worlds.execution_of(job.task, spec.execution)
-        world = run_worlds.for_guard(run, execution, spec.world, read=world, quiet=False)
+        world = worlds.for_guard(run, spec.execution, spec.world, read=world)
         _check_width(job, world.map, "The World")
         usual = None if job.task.guard_by_card else job.task.guard
         options = dict(spec.guard_options)
@@ -156,7 +154,7 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
         return policy
     world = read
     if asked and (read is None or spec.world is not None):
-        world = run_worlds.for_guard(run, worlds.execution_of(job.task, None), spec.world, read=read, quiet=False)
+        world = worlds.for_guard(run, None, spec.world, read=read)
     if world is None or (world.barrier is None and not asked):
         return policy
     _check_width(job, world.map, "The World")
@@ -206,7 +204,7 @@ def load_job(run: Run, agents: int | None = None) -> Job:
         task = _task_of_data(stored, hazard, spec)
         feature_map = features.from_dict(stored["feature_map"])
         team = stored.get("team", spec.n_agents)
-        widths = _stored_widths(stored)
+        widths = stored.get("widths") or (None, None)
     if agents is not None and agents != team:
         task = registry.of_team(task, agents)
         team = agents
@@ -251,12 +249,6 @@ def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: S
         action_high=spec.action_high,
         homogeneous=spec.homogeneous,
     )
-
-
-def _stored_widths(stored: Mapping[str, Any]) -> tuple[int | None, int | None]:
-    """Entries of an observation and of the state, where they are told."""
-    observation, state = stored.get("widths") or (None, None)
-    return observation, state
 
 
 def make_policy(job: Job, state: PyTree, options: Mapping[str, Any]) -> Policy:

@@ -101,16 +101,16 @@ def _barrier_around(run: Run, state: np.ndarray | None) -> tuple[Around, Barrier
     import jax
     import jax.numpy as jnp
 
-    from ringfence.loading import run_worlds
     from ringfence.loading.resolve import load
     from ringfence.nets.heads import barrier_on
+    from ringfence.training import worlds
 
     if not run.checkpoints():
         raise UserError(f"'{run.path}' holds no checkpoint.")
     job, loaded = load(run)
     policy: Any = loaded  # whatever planner it is
     networks = getattr(policy, "networks", {})
-    learned = run_worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
+    learned = worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
     radius = getattr(job.hazard.hazard, "radius", None)
     n = job.spec.n_agents
     if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:

@@ -87,7 +87,8 @@ def make_job(
         _refuse_blank_costs(a.name, task, store, cost_source)
     settings = None
     if wanted is not None and store is not None:
-        settings = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
+        asked = {**wanted, **(world or {})}
+        settings = dataclasses.asdict(worlds.settings_for(task, worlds.costs_tell(store), **asked))
     elif world:
         raise UserError(f"{a.name} reads no World in training; leave world= out.")
     team = spec.n_agents if store is None else store.card.team or store.n_agents

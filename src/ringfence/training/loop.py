@@ -24,7 +24,7 @@ import numpy as np
 from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
-from ringfence.logs.provenance import other_data, regenerated
+from ringfence.logs.provenance import other_data
 from ringfence.logs.resolution import require_resolved
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, draw
@@ -89,16 +89,17 @@ def train(
     place = folder or (lambda seed: folder_of(out, job, seed))
     runs = [Run(place(seed)) for seed in seeds]
     fresh = [run for run in runs if not run.path.exists()]
+    card = worlds.card_of(data)
     with _undone(fresh):
         for run, seed in zip(runs, seeds):
-            _prepare(run, job, seed, data)
+            _prepare(run, job, seed, data, card)
     steps = job.config.num_updates
     for run in runs:
         run.drop_damaged()
     chunk = chunk or max(1, steps // 40)
     every = checkpoint_every or max(chunk, steps // 4)
     options = _Options(chunk, every, tensorboard, quiet, on_chunk, on_finish, vmap_seeds)
-    _finish_all(job, _Lessons(job, logs, quiet), runs, seeds, fresh, options)
+    _finish_all(job, _Lessons(job, data, logs, quiet), runs, seeds, fresh, options)
     return runs
 
 
@@ -168,7 +169,8 @@ class _Lessons:
     all seeds' where no World is read."""
 
     job: Job
-    store: EpisodeStore
+    data: EpisodeStore
+    logs: EpisodeStore  # of the data, as the task splits them
     quiet: bool
     last: tuple[int, World | None, WindowData] | None = None
 
@@ -177,8 +179,8 @@ class _Lessons:
             self.last = None  # there may be no room for two
             world = None
             if self.job.world is not None:
-                world = worlds.fit(self.store, task=self.job.task, seed=seed, quiet=self.quiet, **self.job.world)
-            self.last = (seed, world, windows_of(self.job, self.store, world))
+                world = worlds.fit(self.data, seed=seed, quiet=self.quiet, **self.job.world)
+            self.last = (seed, world, windows_of(self.job, self.logs, world))
         return self.last[1:]
 
 
@@ -422,10 +424,7 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
     return Path(out) / job.task.name / name / f"seed-{seed}"
 
 
-def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
-    card = data.card.to_dict()
-    if not regenerated(card):
-        card["content"] = data.content
+def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore, card: dict[str, Any]) -> None:
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
         there = run.config

@@ -6,6 +6,7 @@ episodes.json   digest of every episode that was trained on
 logs.json       what these earned and cost, where the data is of no benchmark
 metrics.jsonl   one line per logged chunk of updates
 ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
+world, guard    .safetensors: the World that training read, and the one that guards (worlds.py)
 results.json    what `ringfence eval` measured, one entry per variant
 """
 

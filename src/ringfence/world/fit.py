@@ -27,7 +27,7 @@ from ringfence.problem.normalise import varying
 from ringfence.types import Key, Spec
 from ringfence.utils.cache import cache_dir
 from ringfence.utils.device import on_device
-from ringfence.utils.files import whole, writable
+from ringfence.utils.files import whole
 from ringfence.utils.progress import Parts
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
@@ -39,9 +39,9 @@ from ringfence.world.causes import Found
 from ringfence.world.cells import Cells
 from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
-from ringfence.world.model import World, blank_world, load, save
+from ringfence.world.model import World, blank_world
 
-FORMAT = 6  # of what is fitted, found and told: what is cached of another is made again
+FORMAT = 6  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.95  # recall of causes, below which networks on all entries are tried, too
 STATES = 20_000  # steps that a barrier's features are standardised by
@@ -71,8 +71,7 @@ T = TypeVar("T")
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A World to be fitted: the store's, in the view `map` of `spec`. `hazard`, bound to the view, labels states where
-    `settings.labels` is "formula". Of the same data, settings and seed parts are taken from the cache, and the World
-    once it is kept there."""
+    `settings.labels` is "formula". Of the same data, settings and seed parts are taken from the cache."""
 
     store: EpisodeStore
     map: features.FeatureMap
@@ -83,47 +82,13 @@ class Fit:
     cached: bool
     bar: Parts
 
-    def kept(self) -> World | None:
-        """The World in the cache; None where there is none, a damaged one, or one of other data, settings or seed,
-        which somebody has put there."""
-        if not self.cached:
-            return None
-        try:
-            found = load(self.world_file, lambda *_: self.map) if self.world_file.exists() else None
-        except UserError:
-            found = None
-        about = self.store.card.content or self.store.content, self.settings, self.seed
-        if found is not None and (found.card.data.content, found.card.settings, found.card.seed) == about:
-            return found
-        writable(self.world_file)  # before minutes are spent
-        return None
-
-    def keep(self, world: World) -> World:
-        """The World, which is in the cache from now on."""
-        if self.cached:
-            save(world, self.world_file)
-        return world
-
-    @functools.cached_property
-    def world_file(self) -> Path:
-        """Where the World is kept."""
-        store, card = self.store, self.store.card  # `content` of agents who see for themselves is of the whole team's
-        told = [card.task, card.hazard, card.dt, card.content, card.action_delay, card.origins, _agents(store)]
-        asked = dataclasses.asdict(judging.JUDGING)
-        return self.file("world", [store.content, features.to_dict(self.map), card.bounds, store.limits, *told, asked])
-
-    def file(self, name: str, content: list[Any], of: Sequence[str] | None = None) -> Path:
-        """Where what depends on `content` and on the settings is kept: on those of the parts `of`, or on all."""
-        settings = dataclasses.asdict(self.settings)
-        by_formula = self.settings.labels == "formula" and (of is None or "label" in of)
+    def file(self, name: str, content: list[Any], of: Sequence[str]) -> Path:
+        """Where what depends on `content` and on the settings of the parts `of` is kept."""
+        read = {"view", "execution", *(field for part in of for field in PARTS[part])}
+        settings = {field: value for field, value in dataclasses.asdict(self.settings).items() if field in read}
+        by_formula = self.settings.labels == "formula" and "label" in of
         formula = constraints.to_dict(self.hazard.hazard) if self.hazard is not None and by_formula else None
-        if of is not None:
-            read = {"view", "execution", *(field for part in of for field in PARTS[part])}
-            settings = {field: value for field, value in settings.items() if field in read}
-        about = [FORMAT, name, content, settings, self.seed, formula]
-        written = msgspec.json.encode(about, enc_hook=np.ndarray.tolist, order="deterministic")
-        code = hashlib.sha256(written).hexdigest()[:16]
-        return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+        return cached_file(name, [content, settings, self.seed, formula])
 
     def found(self, name: str, content: list[Any], kind: type[T], make: Callable[[], T]) -> T:
         """What is found about a part before it is fitted; made, and then kept, where it is not there."""
@@ -151,6 +116,13 @@ class Fit:
         if self.cached:
             save_named(file, named_arrays(made), {"key": file.stem})
         return made
+
+
+def cached_file(name: str, about: list[Any]) -> Path:
+    """Where a part of a World, or the whole, is kept that follows from all that `about` tells."""
+    written = msgspec.json.encode([FORMAT, name, *about], enc_hook=np.ndarray.tolist, order="deterministic")
+    code = hashlib.sha256(written).hexdigest()[:16]
+    return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
 
 
 def _read(file: Path, template: T) -> T | None:

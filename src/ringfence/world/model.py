@@ -16,6 +16,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import load_file
 
+from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.problem.constraints import CostColumn, Hazard, from_dict
@@ -31,9 +32,6 @@ from ringfence.world import dynamics, values
 from ringfence.world.card import Card
 from ringfence.world.settings import Settings
 from ringfence.world.verdict import look_of
-
-# (task, view, hazard) -> the view of a simulated task; None of own data, whose file says all of it
-MapOf = Callable[[str, features.View, dict], features.FeatureMap | None]
 
 
 class World(eqx.Module):
@@ -128,15 +126,16 @@ def _digest(arrays: dict[str, np.ndarray], about: Mapping[str, Any]) -> str:
 
 
 @in_float32
-def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> World:
-    """The World in a file."""
+def load(path: str | Path, map: features.FeatureMap | None = None) -> World:
+    """The World in a file that `save` or `ringfence fit --out` wrote, or in a run folder. `map`: its view, if it is
+    known; else that of the task's simulator, and of own data the file says all of it."""
     path = place(path)
     try:
         regular(path)
     except ValueError as error:
         raise UserError(f"'{path}' is no World that can be read ({error}); fit one with `ringfence fit`.") from None
     try:
-        return _read(path, map_of)
+        return _read(path, map)
     except UserError:
         raise
     except Exception as error:  # what is in it may be anything
@@ -145,7 +144,7 @@ def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> W
         ) from error
 
 
-def _read(path: Path, map_of: MapOf) -> World:
+def _read(path: Path, map: features.FeatureMap | None) -> World:
     with safe_open(path, "numpy") as file:
         about = schemas.decode((file.metadata() or {})["ringfence_world"], schemas.World)
     raw = load_file(path)
@@ -158,7 +157,9 @@ def _read(path: Path, map_of: MapOf) -> World:
     card = card if card.look is not None else msgspec.structs.replace(card, look=look_of(card))
     spec = Spec.of(about["spec"])
     settings = card.settings
-    map = map_of(spec.task, settings.view, card.data.hazard) or features.from_dict(dict(about["map"]))
+    if map is None:
+        known = registry.simulated(spec.task, from_dict(card.data.hazard))
+        map = features.from_dict(dict(about["map"])) if known is None else known.feature_map(settings.view)
     if settings.alone:
         map = features.alone(map)
     if map.names != spec.feature_names:

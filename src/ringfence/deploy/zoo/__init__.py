@@ -19,8 +19,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 from ringfence.errors import UserError, unknown
-from ringfence.loading.run_worlds import GUARD, WORLD
 from ringfence.training.runs import Run, write_json
+from ringfence.training.worlds import GUARD, WORLD
 from ringfence.utils.files import whole, writable
 from ringfence.utils.pytrees import digest_of, named_arrays, save_named
 from ringfence.world import World

@@ -31,14 +31,13 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.problem.features import given_names
 from ringfence.problem.names import Names
-from ringfence.training import worlds
 from ringfence.training.runs import Run
 from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import refuse_other_order
 from ringfence.utils.precision import in_float32
 from ringfence.utils.progress import Progress
-from ringfence.world import World
+from ringfence.world import World, load
 from ringfence.world.causes import Found
 from ringfence.world.logged import held_out, labels_of, unsafe_of
 
@@ -98,7 +97,7 @@ def replay(
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     given: dict[str, Any] = {"barrier": barrier} if barrier else {}
     if world is not None:
-        given["world"] = world if isinstance(world, World) else worlds.load(world)
+        given["world"] = world if isinstance(world, World) else load(world)
     given |= options
     if compensate:
         given |= _compensated(run, logs.task, guard, given, anyway, faults)
