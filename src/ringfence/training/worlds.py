@@ -243,7 +243,7 @@ def with_world(play: Callable[P, T], *given: P.args, **options: P.kwargs) -> T:
             return play(*given, **options)
         except NoWorld as refused:
             lacking = refused
-        fit_run(lacking.folder, execution=lacking.execution, quiet=bool(options.get("quiet", True)))
+        fit_run(lacking.folder, execution=lacking.execution, quiet=False)  # it takes minutes
     return play(*given, **options)
 
 
