@@ -94,7 +94,7 @@ def test_a_group_is_no_array(tmp_path, name):
         ('{"hazard": null}', "hazard=None; it must be a Separation"),
         ('{"hazard": "near"}', "hazard='near'; it must be"),
         ('{"hazard": {"kind": "All", "hazards": [3]}}', "which is none"),
-        ('{"hazard": {"kind": []}}', "which is none"),
+        ('{"hazard": {"kind": []}}', "Unknown hazard"),
         ('{"hazard": {"kind": "Separation", "radius": null}}', "which is none"),
         ('{"hazard": {"kind": "SpeedLimit", "limit": 1, "features": 3}}', "which is none"),
         ('{"task": 3}', "task=3; it must be a name without slashes"),
