@@ -752,22 +752,21 @@ def plans_cross() -> tuple[bool, str]:
 def plans_run() -> tuple[bool, str]:
     """On robots under `adapt`: what plans earn more than clones, of the same seeds on the same resets, and whether both
     keep the limit."""
-    words, more, clearly, kept = [], 0, {"ant": 0, "halfcheetah": 0}, True
-    tasks = [t for t in planner_tables.paper.PRINTED if not t.startswith("simple")]
-    for task in tasks:
+    apart, runs, kept = {}, [], True
+    for task in [t for t in planner_tables.paper.PRINTED if not t.startswith("simple")]:
         rows = planner_tables.rows_of("robots", task)
         ways = (("icbf", "cool, under adapt"), ("bc", "under adapt"))
         plans, clones = ({r["seed"]: r for r in planner_tables.played(rows, *way)} for way in ways)
         seeds = sorted(plans.keys() & clones.keys())
-        both = [planner_tables.episodes([some[s] for s in seeds], "return") for some in (plans, clones)]
-        low, high = mean_of_runs(both[0] - both[1])
-        more += both[0].mean() > both[1].mean()
-        clearly[task.split("_")[0]] += low > 0
+        of_plans, of_clones = (planner_tables.episodes([some[s] for s in seeds], "return") for some in (plans, clones))
+        apart[task] = (of_plans - of_clones).mean()
+        runs += [mean_of_runs(each[None]) for each in of_plans - of_clones]
         cost = max(np.mean([some[s]["cost"] for s in seeds]) for some in (plans, clones))
         kept = kept and cost <= TASKS[task].cost_limit
-        words.append(f"{task} [{low:+.0f}, {high:+.0f}], {len(seeds)}")
-    holds = more == len(tasks) and clearly == {"ant": 4, "halfcheetah": 0} and kept
-    return bool(holds), "; ".join(words)
+    more, less = sum(low > 0 for low, _ in runs), sum(high < 0 for _, high in runs)
+    words = ", ".join(f"{task} {mean:+.0f}" for task, mean in apart.items())
+    holds = len(apart) == 9 and min(apart.values()) > 0 and more > len(runs) / 2 and not less and kept
+    return bool(holds), f"{words}; of {len(runs)} runs {more} more, {less} less"
 
 
 @on("results/planner")
