@@ -712,11 +712,10 @@ def wide_plans_pay() -> tuple[bool, str]:
         task = f"simple_spread-{task}"
         rows = planner_tables.rows_of("rows", task)
         both = [planner_tables.played(rows, "icbf", way) for way in ("best of 64", "best of 64, spread 1")]
-        seeds = {r["seed"] for r in both[0]} & {r["seed"] for r in both[1]}
-        wide, near = (planner_tables.episodes([r for r in some if r["seed"] in seeds], "return") for some in both)
-        low, high = mean_of_runs(TASKS[task].normalised_return(wide) - TASKS[task].normalised_return(near))
+        wide, near = (TASKS[task].normalised_return(x) for x in planner_tables.paired(*both))
+        low, high = mean_of_runs(wide - near)
         holds = holds and low > 0 and max(r["cost_safe_start"] for r in both[0]) < 0.05
-        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(seeds)} seeds")
+        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(wide)} seeds")
     return bool(holds), "; ".join(words)
 
 
@@ -728,11 +727,10 @@ def same_from_plans() -> tuple[bool, str]:
         task = f"simple_spread-{task}"
         rows = planner_tables.rows_of("guards", task)
         both = [planner_tables.played(rows, name, "under full") for name in ("icbf", "bc")]
-        seeds = {r["seed"] for r in both[0]} & {r["seed"] for r in both[1]}
-        plans, clones = (planner_tables.episodes([r for r in some if r["seed"] in seeds], "return") for some in both)
-        low, high = mean_of_runs(TASKS[task].normalised_return(plans) - TASKS[task].normalised_return(clones))
-        holds = holds and low < 0 < high and len(seeds) >= 3
-        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(seeds)} seeds")
+        plans, clones = (TASKS[task].normalised_return(x) for x in planner_tables.paired(*both))
+        low, high = mean_of_runs(plans - clones)
+        holds = holds and low < 0 < high and len(plans) >= 3
+        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(plans)} seeds")
     return bool(holds), "; ".join(words)
 
 
@@ -741,7 +739,7 @@ def plans_cross() -> tuple[bool, str]:
     """On Crossing under a shield: what plans earn more than clones, and steps in contact of either."""
     rows = planner_tables.rows_of("crossing", "crossing-hasty")
     both = [planner_tables.played(rows, name, "under shield") for name in ("icbf", "bc")]
-    plans, clones = (planner_tables.episodes(some, "return") for some in both)
+    plans, clones = planner_tables.paired(*both)
     low, high = mean_of_runs(plans - clones)
     cost = max(r["cost"] for some in both for r in some)
     words = f"{plans.mean():.2f} for {clones.mean():.2f} [{low:+.2f}, {high:+.2f}], {len(plans)} seeds, cost {cost}"
@@ -756,12 +754,11 @@ def plans_run() -> tuple[bool, str]:
     for task in [t for t in planner_tables.paper.PRINTED if not t.startswith("simple")]:
         rows = planner_tables.rows_of("robots", task)
         ways = (("icbf", "cool, under adapt"), ("bc", "under adapt"))
-        plans, clones = ({r["seed"]: r for r in planner_tables.played(rows, *way)} for way in ways)
-        seeds = sorted(plans.keys() & clones.keys())
-        of_plans, of_clones = (planner_tables.episodes([some[s] for s in seeds], "return") for some in (plans, clones))
-        apart[task] = (of_plans - of_clones).mean()
-        runs += [mean_of_runs(each[None]) for each in of_plans - of_clones]
-        cost = max(np.mean([some[s]["cost"] for s in seeds]) for some in (plans, clones))
+        both = [planner_tables.played(rows, *way) for way in ways]
+        more = np.subtract(*planner_tables.paired(*both))
+        apart[task] = more.mean()
+        runs += [mean_of_runs(each[None]) for each in more]
+        cost = max(np.mean([r["cost"] for r in some]) for some in both)
         kept = kept and cost <= TASKS[task].cost_limit
     more, less = sum(low > 0 for low, _ in runs), sum(high < 0 for _, high in runs)
     words = ", ".join(f"{task} {mean:+.0f}" for task, mean in apart.items())

@@ -62,15 +62,19 @@ def brief(found: Rows) -> str:
     return f"{reward:.2f} / {cost:.2f} [{len(found)}]"
 
 
+def paired(found: Rows, others: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """(seeds, episodes) returns of runs, and those of others, of the seeds that both have, on the same resets."""
+    of, of_others = ({r["seed"]: r for r in rows} for rows in (found, others))
+    seeds = sorted(of.keys() & of_others.keys())
+    return episodes([of[s] for s in seeds], "return"), episodes([of_others[s] for s in seeds], "return")
+
+
 def less(found: Rows, others: Rows, task: str) -> str:
     """Return of runs less that of others, by the same seeds on the same resets; bold beyond chance."""
-    seeds = sorted({r["seed"] for r in found} & {r["seed"] for r in others})
-    if not seeds:
+    both = paired(found, others)
+    if not len(both[0]):
         return "–"
-    of = [[next(r for r in some if r["seed"] == s) for s in seeds] for some in (found, others)]
-    x = TASKS[task].normalised_return(episodes(of[0], "return")) - TASKS[task].normalised_return(
-        episodes(of[1], "return")
-    )
+    x = np.subtract(*(TASKS[task].normalised_return(each) for each in both))
     low, high = mean_of_runs(x)
     text = f"{x.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
     return f"**{text}**" if low > 0 or high < 0 else text

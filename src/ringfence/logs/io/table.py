@@ -322,7 +322,7 @@ def _arrays(
     ends = np.cumsum(episodes.lengths - 1)
     rows = looked_at(ends)
     origins = None
-    if not lost and "observation_origins" not in card:
+    if not lost and not card.get("observation_origins"):
         before, after = (episodes.seen(episodes.rows[each]) for each in (rows, rows + 1))
         origins = origins_of({"observations": (before, after)}).get("observations")
     return {
