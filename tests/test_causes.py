@@ -42,10 +42,11 @@ from ringfence.world.card import (
     Verdict,
 )
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
-from ringfence.world.causes import SLOPED, Cause, Edge, Found
+from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
 from ringfence.world.dynamics import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
+from ringfence.world.quantities import Entry, Length
 from tests.quick import IN_FULL, QUICK_WORLD
 
 N, STEPS = 3, 40
@@ -98,7 +99,7 @@ def test_rays_of_a_lidar_are_one_cause(called):
     names = ["own.v", *(called.format(k) for k in range(12))]
     found, _ = cause_search.find(x, unsafe, np.repeat(np.arange(300), 40), names)
     (cause,), (edge,) = found.causes, found.edges
-    assert (cause.name, cause.length, len(cause.things)) == (called[:-2].rstrip("[_{"), True, 12)
+    assert (cause.name, cause.things) == (f"|{called[:-2].rstrip('[_{')}|", 12)
     assert edge.at == pytest.approx(0.6, abs=0.01) and edge.below
     assert edge.bounds == (pytest.approx(0.6, abs=0.01),)
     assert found.explained > 0.99
@@ -106,14 +107,19 @@ def test_rays_of_a_lidar_are_one_cause(called):
 
 def test_numbers_alone_make_no_row():
     rows = cause_candidates.candidates([f"obs{d}" for d in range(5)] + ["a_1", "a_2"])
-    assert not any(len(cause.things) > 1 for cause in rows)
+    assert not any(cause.things > 1 for cause in rows)
 
 
 def test_causes_are_found_without_names(logged):
     x, unsafe, episode = logged
     found, _ = cause_search.find(x, unsafe.any(1), episode, [f"e{d}" for d in range(x.shape[-1])])
-    entries = {c.things[0] for c in found.causes}
+    entries = {tuple(sorted(c.entries()[0])) for c in found.causes}
     assert {(5, 6), (7, 8), (2,), (0, 1)} == entries
+
+
+def thresholds(cause: Cause) -> list[float]:
+    """Of the conditions of a rule."""
+    return [-one.more / one.weights[0] for one in cause.reads[0].parts]
 
 
 @pytest.mark.parametrize("axes", ["xy", "xyz"])
@@ -126,11 +132,11 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     names = [f"other{j}.d{c}" for j in range(N - 1) for c in axes]
     found, cells = cause_search.find(others.reshape(9000, N, -1), unsafe, np.arange(9000) // 30, names)
     (cause,), (edge,) = found.causes, found.edges
-    assert cause.name == f"other.{', '.join('d' + c for c in axes[:-1])} or {cause.ratio:.3g} d{axes[-1]}, the longer"
-    assert edge.below and abs(edge.at - 3.0) < 0.05 and abs(edge.at / cause.ratio - 0.5) < 0.01
+    assert [at for at in thresholds(cause)] == [pytest.approx(3.0, abs=0.05), pytest.approx(0.5, abs=0.01)]
+    assert cause.name.endswith(f"|other.d{axes[-1]}| below 0.5") and edge.bounds == (0.0,)
     assert found.explained > 0.9 and found.false_alarms < 0.01
     x = others[:50].reshape(50, N, -1)
-    np.testing.assert_allclose(cause.of(x), cause.of(jnp.asarray(x), SLOPED), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(cause.of(x), cause.of(jnp.asarray(x)), rtol=1e-4, atol=1e-4)
     loaded = msgspec.json.decode(msgspec.json.encode(found), type=Found)
     assert loaded == found
 
@@ -138,13 +144,13 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
 @pytest.mark.parametrize(
     "what, name",
     [
-        ("soon", "other.distance less 1.5 times how fast it shrinks"),
-        ("braking", "post.distance less 1.5 times how fast it shrinks"),
-        ("fast", "other.distance while length of own.vx, own.vy is high"),
-        ("seen", "other.distance ahead"),
-        ("ahead", "other.distance ahead"),
-        ("head-on", "other.distance while how fast it shrinks is high"),
-        ("strip", "own.x, length of own.vx, own.vy"),
+        ("soon", "other.distance less 1.5 times how fast other.distance shrinks below"),
+        ("braking", "post.distance less 1.5 times how fast post.distance shrinks below"),
+        ("fast", "other.distance below 5 and length of own.vx, own.vy above 3"),
+        ("seen", "other.distance below 8 and angle to other below 0.79"),
+        ("ahead", "other.distance below 8 and angle to other below 0.79"),
+        ("head-on", "other.distance below 12 and how fast other.distance shrinks above 3"),
+        ("strip", "own.x above 6 and length of own.vx, own.vy above 3"),
         ("crowded", "other.distance of the second nearest"),
         ("lost", "other.distance of the nearest"),
     ],
@@ -179,19 +185,23 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     others = np.concatenate([offset, velocity], -1).reshape(9000, N, -1)
     x = np.concatenate([place[..., None], own, looks, others], -1).astype(np.float32)
     found, _ = cause_search.find(x, unsafe.any((1, 2)), np.arange(9000) // 30, names)
-    assert [cause.name for cause in found.causes] == [name]
+    (cause,) = found.causes
     assert found.explained > 0.9 and found.false_alarms < 0.03
     at = found.edges[0].at
     if what in ("soon", "braking"):
-        assert at is not None and abs(at) < 0.1
+        assert cause.name.startswith(name) and abs(cause.reads[0].more) < 0.1
     elif what in ("crowded", "lost"):
+        assert cause.name == name
         assert abs(at - {"crowded": 9, "lost": 25}[what]) < 0.1 and found.edges[0].below == (what == "crowded")
-    elif what != "strip":  # what is in one number has two edges
-        near, second = {"fast": (5.0, 3.0), "head-on": (12.0, 3.0)}.get(what, (8.0, np.arccos(0.7)))
-        assert abs(at - near) < 0.1 and abs(found.causes[0].second_edge(at) - second) < 0.05
-    np.testing.assert_allclose(found.causes[0].of(x), found.causes[0].of(jnp.asarray(x), SLOPED), rtol=1e-3, atol=1e-3)
+    else:
+        told = {"fast": (5.0, 3.0), "head-on": (12.0, 3.0), "strip": (6.0, 3.0)}.get(what, (8.0, np.arccos(0.7)))
+        np.testing.assert_allclose(thresholds(cause), told, atol=0.05)
+        assert [part.words.rpartition(" ")[0] for part in cause.reads[0].parts] == [
+            part.rpartition(" ")[0] for part in name.split(" and ")
+        ]
+    np.testing.assert_allclose(found.causes[0].of(x), found.causes[0].of(jnp.asarray(x)), rtol=1e-3, atol=1e-3)
     here = jnp.zeros((N, x.shape[-1]))
-    assert np.isfinite(jax.grad(lambda x: found.causes[0].of(x, SLOPED).sum())(here)).all()
+    assert np.isfinite(jax.grad(lambda x: found.causes[0].of(x).sum())(here)).all()
 
 
 def test_what_has_room_for_one_is_dangerous_for_two():
@@ -202,22 +212,22 @@ def test_what_has_room_for_one_is_dangerous_for_two():
     names = ["own.x", "own.y", *(f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy"))]
     found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 30, names)
     (cause,) = found.causes
-    assert cause.name == "other.place, own.place"
-    assert found.explained > 0.9 and found.false_alarms < 0.1
-    np.testing.assert_allclose(cause.of(x)[:, 0, 0], place[:, :2].reshape(30_000, 4), atol=1e-5)
-    np.testing.assert_allclose(cause.of(jnp.asarray(x), SLOPED), cause.of(x), atol=1e-5)
+    assert len(thresholds(cause)) == 8 and np.allclose(np.abs(thresholds(cause)), 3.0, atol=0.1)
+    assert "own.x and other.dx below" in cause.name
+    assert found.explained > 0.99 and found.false_alarms < 0.01
+    np.testing.assert_allclose(cause.of(jnp.asarray(x)), cause.of(x), atol=1e-5)
 
 
 def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
     names = ["other0.dx", "other0.dy", "own.cos", "own.sin"]
     ahead, angle = (
-        next(one for one in cause_candidates.with_distances(of) if one.how == "turned")
+        next(one for one in cause_candidates.pairs(of) if "other.ahead" in one.name)
         for of in (names, [*names[:2], "own.yaw"])
     )
     x = np.random.default_rng(0).normal(0, 2, (50, 1, 3)).astype(np.float32)
     looks = np.concatenate([x[..., :2], np.cos(x[..., 2:]), np.sin(x[..., 2:])], -1)
     np.testing.assert_allclose(ahead.of(looks), angle.of(x), atol=1e-5)
-    np.testing.assert_allclose(angle.of(jnp.asarray(x), SLOPED), angle.of(x), atol=1e-5)
+    np.testing.assert_allclose(angle.of(jnp.asarray(x)), angle.of(x), atol=1e-5)
 
 
 def test_danger_that_nothing_tells_has_no_cause(logged):
@@ -257,7 +267,7 @@ def test_what_holds_for_some_agents_alone_is_found(logged):
     apart = np.linalg.norm(x[:, 0, 5:7], axis=-1) > 3.0
     found, _ = cause_search.find(x, apart, episode, NAMES)
     assert len(found.causes) == 1 and found.explained > 0.9
-    assert found.causes[0].length and set(found.causes[0].who) <= {(0, 0), (1, 0)}
+    assert found.causes[0].vector and set(found.causes[0].who) <= {(0, 0), (1, 0)}
     assert "of agent" in found.causes[0].name
     assert abs(found.edges[0].at - 3.0) < 0.05 and not found.edges[0].below
     net = blank(found, 8)[0]
@@ -326,11 +336,11 @@ def test_causes_of_fewer_entries_take_the_place_of_one_of_more():
     """Two entries tell who is next to the agents in the middle; each by itself tells it, too, wherever the other is."""
     x, unsafe, episode, names = row_of(3, 20_000)
     steps = cause_counts.some_steps(x, unsafe, episode, np.random.default_rng(0))
-    both = causes.Cause("e0, e1", ((0, 1),))
+    both = Cause((Entry((0,), "e0"), Entry((1,), "e1")))
     whole = cause_counts.counted(steps, both, cause_counts.Explained.by(steps, []))
     split = cause_search._split(steps, [whole], names)
-    assert {one.cause.things for one in split} == {((0,),), ((1,),)}
-    place = causes.Cause("x, y", ((0, 1),))  # a post: neither entry tells it
+    assert {one.cause.name for one in split} == {"e0", "e1"}
+    place = Cause((Entry((0,), "x"), Entry((1,), "y")))  # a post: neither entry tells it
     x = np.random.default_rng(0).uniform(-1, 1, (20_000, 1, 2)).astype(np.float32)
     steps = cause_counts.some_steps(x, (x**2).sum((1, 2)) < 0.1, episode, np.random.default_rng(0))
     post = cause_counts.counted(steps, place, cause_counts.Explained.by(steps, []))
@@ -348,7 +358,8 @@ def cells_of(pattern, length=True, visits=100.0):
     """Cells of one number from 0 to 1, as dangerous as the pattern says; None: never visited."""
     known = np.array([v is not None for v in pattern])
     danger = np.array([v or 0.0 for v in pattern])
-    cause = causes.Cause("d", ((0,),), length)
+    entry = Entry((0,), "d")
+    cause = Cause((Length((entry,)) if length else entry,))
     return Cells(cause, np.zeros(1), np.ones(1), len(pattern), visits * known, danger)
 
 
@@ -368,7 +379,7 @@ def test_an_edge_does_not_flicker_and_unvisited_ends_are_unsafe():
 
 
 def test_a_distance_grows_without_end_and_nearer_is_worse():
-    found = causes.Found((causes.Cause("d", ((0,),), True),), edges=(cells_of([0.99] * 4 + [0.0] * 16).edge,))
+    found = Found((Cause((Length((Entry((0,), "d"),)),)),), edges=(cells_of([0.99] * 4 + [0.0] * 16).edge,))
     net = blank(found, 8)[0]
     at = jnp.linspace(0.0, 50.0, 500)[:, None]
     along = np.asarray(net.of_values(at))
@@ -397,7 +408,7 @@ def test_scores_of_causes_read_what_they_name(logged):
     found, _ = cause_search.find(x, unsafe.any(1), episode, NAMES)
     for net in blank(found, 8, jax.random.key(0)):
         each = scores(net, jnp.asarray(x[:5]))
-        assert each.shape == (5, N, len(net.cause.things))
+        assert each.shape == (5, N, net.cause.things)
         np.testing.assert_allclose(net.of_values(jnp.asarray(net.cause.of(x[:5]))), each, atol=1e-4)
 
 
@@ -555,7 +566,7 @@ def test_somebody_is_put_at_rest_and_closing():
 
 
 def test_a_cause_of_a_place_has_a_map():
-    cause = Cause("own.x, own.y", ((0, 1),))
+    cause = Cause((Entry((0,), "own.x"), Entry((1,), "own.y")))
     found = Found((cause,), edges=(Edge((-1.0, -2.0), (1.0, 2.0)),))
     plane = probes._map(blank(found, 8, jax.random.key(0))[0], 1.0)
     assert plane.x[0] == -1.2 and plane.y[-1] == 2.4 and np.shape(plane.scores) == (len(plane.y), len(plane.x))
@@ -588,7 +599,7 @@ def test_verdicts_give_their_reasons():
     for changes, word, reason in cases:
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, **changes)))
         assert found.word == word and found.reasons == (reason,) and found.remedies
-    of_cause = Cause("own.x", ((0,),))
+    of_cause = Cause((Entry((0,), "own.x"),))
     for told, recall, word in ((0.59, 0.96, "weak"), (0.59, 1.0, "fit"), (0.93, 0.96, "fit")):
         causes = {"": Found((of_cause,), told)}
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, recall=recall), causes=causes))
@@ -652,7 +663,7 @@ def test_a_card_says_how_far_guards_look_and_what_their_margin_is():
     assert "Default margin 4 (--margin 1 stands for it)" in words(15)
     assert "Margins that are added" not in words(15)
     wider = BarrierScores(margin=4.0, widening=((0.0,) * 15, (0.0,) * 4 + (0.5,) * 11))
-    two = Found(tuple(Cause(name, ((0,),)) for name in ("own.v", "own.x")), edges=(Edge((0.0,), (1.0,)),) * 2)
+    two = Found(tuple(Cause((Entry((0,), name),)) for name in ("own.v", "own.x")), edges=(Edge((0.0,), (1.0,)),) * 2)
     said = str(Card(data=Data(task="t", hazard={}), barrier=wider, causes={"": two}))
     assert "rows ahead, which are predicted worse: own.x 0.5 at 5, 0.5 at 10, 0.5 at 15." in said
 
@@ -692,7 +703,7 @@ def test_a_guards_search_finds_no_danger_in_a_good_barrier_and_some_in_a_bad_one
 
 def test_entries_that_a_cause_does_not_explain_leave_its_margin(fitted):
     """Of a distance the margin is the same where posts and speeds are dangerous, too, of which it knows nothing."""
-    net = next(net for net in fitted.barrier.causes if net.cause.length and "other" in net.cause.name)
+    net = next(net for net in fitted.barrier.causes if net.cause.vector and "other" in net.cause.name)
 
     def length(unsafe) -> float:
         store = store_of(unsafe=unsafe)
@@ -780,10 +791,10 @@ def test_foresight_reads_the_thing_in_most_danger():
     x = np.array([3.0, 0.0, 0.0, 4.0]).reshape(1, 1, 1, 4)
     (cause,) = cause_candidates.offsets([f"other{j}.d{c}" for j in range(2) for c in "xy"])
     near, far = Edge((0.0,), (9.0,), at=1.0), Edge((0.0,), (9.0,), at=1.0, below=False)
-    assert judging._read(x, cause, near) == judging._read(x[..., [2, 3, 0, 1]], cause, near) == 3.0
-    assert judging._read(x, cause, far) == 4.0
-    assert judging._read(x, causes.narrowed(cause, ((0, 1),)), near) == 4.0
-    place = judging._read(x, Cause("own.x, own.y", ((0, 3),)), None)
+    asked = ((x, cause, near), (x[..., [2, 3, 0, 1]], cause, near), (x, cause, far))
+    found = [judging._read(*one).item() for one in (*asked, (x, causes.narrowed(cause, ((0, 1),)), near))]
+    np.testing.assert_allclose(found, [3.0, 3.0, 4.0, 4.0])
+    place = judging._read(x, Cause((Entry((0,), "own.x"), Entry((3,), "own.y"))), None)
     assert place.shape == (1, 1, 2) and judging._lengths(place) == (5.0,)
 
 

@@ -17,7 +17,8 @@ from ringfence.nets import bounds
 from ringfence.nets.mlp import MLP
 from ringfence.world.barrier import Barrier
 from ringfence.world.cause_nets import CauseNet, Distance, worst
-from ringfence.world.causes import Cause, Edge, in_one_number, with_an_axis_apart
+from ringfence.world.causes import Cause, Edge
+from ringfence.world.quantities import All, Closing, Entry, Length, Over, Product, Sum, Turned
 
 ROWS = 10
 
@@ -151,47 +152,45 @@ def test_braking_ends_in_standing(guarded, present):
 
 
 def test_causes_are_bounded_too():
-    """Distances with one edge and several, of a length, of one with an axis apart, of the second nearest and of an
-    entry, and networks of causes of two numbers: several together, and each."""
-    length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
-    entry = Cause("own.x", ((4,),))
-    pair = Cause("own.x, own.y", ((4, 5),))
-    things, own = ((0, 1), (2, 3)), ((4, 5), (4, 5))
-    both = [Cause(f"other.distance, {how}", things, also=own, how=how) for how in ("nearing", "beside", "turned")]
-    both.append(Cause("other.distance, an entry", things, also=((4,), (4,)), how="beside"))
-    both.append(Cause("other.distance, an angle", things, also=((4,), (4,)), how="turned"))
-    both.append(Cause("post.distance, nearing", things, also=own, how="nearing", against=True))
-    places = Cause("other.place, own.place", things, also=own, how="both")
-    vector = Cause("own.x, length", ((4,),), also=((0, 1),), how="vector")
-    second = [
-        (both[0], "soon"),
-        (both[0], "coming"),
-        (both[1], "high"),
-        (both[1], "low"),
-        (both[2], "ahead"),
-        (both[3], "high"),
-        (both[5], "soon"),
+    """Distances with one edge and several, of every quantity and of rules, and networks of several numbers: some of
+    them together, and each."""
+    offset = Entry((0, 2), "other.dx"), Entry((1, 3), "other.dy")
+    own = Entry((4,), "own.x"), Entry((5,), "own.y")
+    against = tuple(Sum((one,), (-1.0,)) for one in own)
+    far, fast = Length(offset), Length(own)
+    turned = [Turned(offset, looks, what) for looks in (own, own[:1]) for what in ("ahead", "aside", "angle")]
+    both = [
+        (far, Closing(offset, own)),
+        (far, fast),
+        turned[:2],
+        turned[3:5],
+        (far, own[0]),
+        (far, Closing(offset, against)),
+    ]
+    places = (*own, *(Sum((mine, theirs), (1.0, 1.0)) for mine, theirs in zip(own, offset)))
+    several = [*both, own, (own[0], Length(offset)), places]
+    numbers = [
+        far,
+        Over(far, "things", 2, 2),
+        Over(far, "things"),
+        Over(Product((own[0], own[1])), "team"),
+        Over(own[0], "team", 1),
+        *turned,
+        *(Sum(pair, (1.0, w), -0.8) for pair in both for w in (-0.7, 0.7)),
+        *(All(tuple(Sum((one,), (w,), -0.5) for one, w in zip(pair, (1.0, -0.6)))) for pair in (*both, places)),
     ]
     edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
     walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)
-    box = with_an_axis_apart(length, 1, 2.0)
-    second_nearest = Cause("other.distance of the second nearest", ((0, 1, 2, 3),), length=True, nearest=(2, 2))
     nets = (
-        Distance(jnp.array([0.4]), jnp.array(1.2), jnp.array(0.3), length, edge),
-        Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), box, edge),
-        Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), second_nearest, edge),
-        *(
-            Distance(jnp.array([0.6]), jnp.array(1.2), jnp.array(0.3), in_one_number(one, how, 0.8, 0.7), edge)
-            for one, how in second
-        ),
-        Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), entry, walls),
+        *(Distance(jnp.array([0.4]), jnp.array(1.2), jnp.array(0.3), Cause((one,)), edge) for one in numbers),
+        Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), Cause(own[:1]), walls),
         *(
             CauseNet(MLP(jax.random.key(4), (k, 16, 16, 1)), jnp.zeros(k), jnp.ones(k), jnp.array(0.1), cause, edge)
-            for cause in (pair, *both, vector, places)
+            for cause in (Cause(tuple(reads)) for reads in several)
             for k in (cause.width,)
         ),
     )
-    center = jax.random.normal(jax.random.key(1), (30, 1, 6))
+    center = jax.random.normal(jax.random.key(1), (30, 2, 6))
     radius = 0.3 * jax.random.uniform(jax.random.key(2), center.shape)
     inside = anywhere(jax.random.key(3), center, radius, 6_000)
     for some in (nets[:3], *((net,) for net in nets)):

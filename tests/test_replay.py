@@ -30,6 +30,7 @@ from ringfence.report import replay_page
 from ringfence.world import save
 from ringfence.world.card import Verdict
 from ringfence.world.causes import Cause, Edge, Found
+from ringfence.world.quantities import Entry, Length
 from tests.quick import QUICK_WORLD
 
 DT, STEPS, EPISODES, RADIUS = 0.1, 40, 12, 0.5
@@ -179,8 +180,8 @@ def test_the_radius_is_that_of_the_worlds_cause_where_costs_tell_no_distance():
     motion = motion_of(store, names_of(store))
     elsewhere = np.random.default_rng(0).random(store.costs.shape) < 0.5
     several = dataclasses.replace(store, costs=np.maximum(store.costs, elsewhere).astype(np.float32))
-    near = Cause("length of other.dx, other.dy", ((2, 3),), length=True)
-    fast = Cause("length of other.dvx, other.dvy", ((4, 5),), length=True)
+    near = Cause((Length((Entry((2,), "other.dx"), Entry((3,), "other.dy"))),))
+    fast = Cause((Length((Entry((4,), "other.dvx"), Entry((5,), "other.dvy"))),))
     edges = (Edge((0.0,), (2.0,), at=0.9, below=False), Edge((0.0,), (2.0,), at=0.45))
     found = Found((fast, near), shares=(0.6, 0.4), edges=edges)
     radius, source = radius_of(several, motion, None, {"contact": found})

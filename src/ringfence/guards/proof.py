@@ -23,11 +23,9 @@ from ringfence.types import Array
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, soft
 from ringfence.world.cause_nets import CauseNet, Distance, Score
-from ringfence.world.causes import Cause
 from ringfence.world.dynamics import Dynamics
 
 EXACT = ("seen",)  # entries that are no measurements, by the ends of their names
-SHORT = 0.01  # length of a vector that may point anywhere, for all that a bound says
 ROUNDING = 1e-5
 
 
@@ -214,8 +212,7 @@ def motion_of(map: FeatureMap) -> Motion:
 def score_below(barrier: Barrier, boxes: Box) -> Array:
     """(...,) below ℓ, before it is bounded softly, of all states in boxes (..., D)."""
     if barrier.causes:
-        parts = [_cause_below(score, boxes, j) for score in barrier.causes for j in range(len(score.cause.things))]
-        return jnp.stack(parts, -1).min(-1)
+        return jnp.concatenate([_cause_below(score, boxes) for score in barrier.causes], -1).min(-1)
     shape = barrier.shape
     center = (boxes.center - barrier.mean) / barrier.scale
     radius = boxes.radius / barrier.scale
@@ -289,122 +286,12 @@ def _most_above(offset: Array, radius: Array, length: Array, slope: Array) -> Ar
     return found
 
 
-def _nearing_bounds(offset: Array, radius: Array, velocity: Array, spread: Array) -> tuple[Array, Array]:
-    """Center and radius (..., 2) of how far things are, and of how fast that comes nearer, within boxes."""
-    low, high = _length_bounds(offset, radius)
-    product = -(offset * velocity).sum(-1)
-    off = (jnp.abs(offset) * spread + radius * (jnp.abs(velocity) + spread)).sum(-1)
-    fastest = jnp.sqrt(((jnp.abs(velocity) + spread) ** 2).sum(-1))  # nothing comes nearer faster than it moves
-    least, most = product - off, product + off
-    near = jnp.maximum(low, 1e-6)
-    slow = jnp.maximum(jnp.where(least < 0, least / near, least / high), -fastest)
-    fast = jnp.minimum(jnp.where(most > 0, most / near, most / high), fastest)
-    return _between(jnp.stack([low, slow], -1), jnp.stack([high, fast], -1))
-
-
-def _beside_bounds(offset: Array, radius: Array, other: Array, spread: Array) -> tuple[Array, Array]:
-    """Likewise of how far things are, and of another entry, or of how long others are."""
-    low, high = _length_bounds(offset, radius)
-    least, most = (other - spread)[..., 0], (other + spread)[..., 0]
-    if other.shape[-1] > 1:
-        least, most = _length_bounds(other, spread)
-    return _between(jnp.stack([low, least], -1), jnp.stack([high, most], -1))
-
-
-def _turned_bounds(offset: Array, radius: Array, direction: Array, spread: Array) -> tuple[Array, Array]:
-    """Likewise of how far ahead and to the left things are of who looks into a direction."""
-    angle, turns = direction[..., 0], spread[..., 0]
-    if direction.shape[-1] > 1:
-        angle, turns = _angle_bounds(direction, spread)
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    across, back = jnp.sin(jnp.minimum(turns, np.pi / 2)), 1.0 - jnp.cos(jnp.minimum(turns, np.pi))
-    by_cos = jnp.abs(sin) * across + jnp.abs(cos) * back
-    by_sin = jnp.abs(cos) * across + jnp.abs(sin) * back
-    x, y = offset[..., 0], offset[..., 1]
-    center = jnp.stack([x * cos + y * sin, y * cos - x * sin], -1)
-    wide, high = radius[..., 0], radius[..., 1]
-    ahead = jnp.abs(x) * by_cos + wide * (jnp.abs(cos) + by_cos) + jnp.abs(y) * by_sin + high * (jnp.abs(sin) + by_sin)
-    left = jnp.abs(y) * by_cos + high * (jnp.abs(cos) + by_cos) + jnp.abs(x) * by_sin + wide * (jnp.abs(sin) + by_sin)
-    off = jnp.stack([ahead, left], -1)
-    return center, off + ROUNDING * (1.0 + jnp.abs(center) + off)
-
-
-def _angle_bounds(direction: Array, spread: Array) -> tuple[Array, Array]:
-    """The angle in the middle of boxes of vectors, and by how much others in them are off it at most: at a corner, or
-    by anything where a box has vectors of next to no length."""
-    middle = jnp.arctan2(direction[..., 1], direction[..., 0])
-    off = jnp.zeros_like(middle)
-    for signs in np.ndindex(2, 2):
-        corner = direction + spread * (2.0 * np.array(signs) - 1.0)
-        turned = jnp.arctan2(corner[..., 1], corner[..., 0]) - middle
-        off = jnp.maximum(off, jnp.abs((turned + np.pi) % (2 * np.pi) - np.pi))
-    short = _length_bounds(direction, spread)[0] < SHORT
-    return middle, jnp.where(short, np.pi, off) + ROUNDING
-
-
-def _with_vector_bounds(entries: Array, radius: Array, also: Array, spread: Array) -> tuple[Array, Array]:
-    """Likewise of entries, and of how long others are."""
-    center, off = _between(*(bound[..., None] for bound in _length_bounds(also, spread)))
-    return jnp.concatenate([entries, center], -1), jnp.concatenate([radius, off], -1)
-
-
-def _both_bounds(offset: Array, radius: Array, place: Array, spread: Array) -> tuple[Array, Array]:
-    """Likewise of where one is, and where things are."""
-    center, off = jnp.concatenate([place, place + offset], -1), jnp.concatenate([spread, spread + radius], -1)
-    return center, off + ROUNDING * (1.0 + jnp.abs(center))
-
-
-SEVERAL_BOUNDS = {
-    "nearing": _nearing_bounds,
-    "beside": _beside_bounds,
-    "turned": _turned_bounds,
-    "vector": _with_vector_bounds,
-    "both": _both_bounds,
-}
-
-
-def _second_bounds(cause: Cause, offset: Array, radius: Array, other: Array, spread: Array) -> tuple[Array, Array]:
-    """The least and the most of what a length reads of other entries."""
-    if cause.how != "ahead":
-        bounds = _nearing_bounds if cause.how in ("soon", "coming") else _beside_bounds
-        center, off = (part[..., 1] for part in bounds(offset, radius, other, spread))
-        center = {"soon": center, "low": center - cause.end}.get(cause.how, cause.end - center)
-        return center - off, center + off
-    center, off = _turned_bounds(offset, radius, other, spread)
-    ahead, left = center[..., 0], center[..., 1]
-    nearer, farther = _length_bounds(left[..., None], off[..., 1:])
-    nearer = jnp.sqrt(nearer**2 + 1e-9)
-    # Of a box the angle is least where it is most ahead, at the side that is nearer where that is ahead.
-    front, back = ahead + off[..., 0], ahead - off[..., 0]
-    least = jnp.arctan2(jnp.where(front > 0, nearer, farther), front)
-    most = jnp.arctan2(jnp.where(back > 0, farther, nearer), back)
-    return least - ROUNDING, most + ROUNDING
-
-
-def _between(low: Array, high: Array) -> tuple[Array, Array]:
-    """Center and radius of boxes from corner to corner, a little more."""
-    center = (low + high) / 2
-    return center, (high - low) / 2 + ROUNDING * (1.0 + jnp.abs(center))
-
-
-def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
-    """(...,) below the score of a cause of one of its things."""
+def _cause_below(score: Score, boxes: Box) -> Array:
+    """(..., J) below the score of a cause."""
     cause = score.cause
-    entries = np.array(cause.things[thing])
-    center, radius = boxes.center[..., entries], boxes.radius[..., entries]
-    also = np.array(cause.also[thing] if cause.also else (), int)
-    others = boxes.center[..., also] * (-1.0 if cause.against else 1.0), boxes.radius[..., also]
-    if cause.length:
-        each = [_length_bounds(*part) for part in zip(cause.parts(center), cause.parts(radius))]
-        if cause.also:
-            each.append(_second_bounds(cause, center, radius, *others))
-        if cause.how == "soon":  # the sooner, the faster things come
-            (near, away), (slow, fast) = each
-            each = [(near, away), (fast, slow)]
-        low, high = (cause.in_one(found) for found in zip(*each))
-        center, radius = (low + high)[..., None] / 2, (high - low)[..., None] / 2 + ROUNDING
-    elif cause.also:
-        center, radius = SEVERAL_BOUNDS[cause.how](center, radius, *others)
+    low, high = cause.between(boxes.center - boxes.radius, boxes.center + boxes.radius)
+    center = (low + high) / 2
+    radius = (high - low) / 2 + ROUNDING * (1.0 + jnp.abs(center))
     gain = jnp.exp(score.log_gain)
     if isinstance(score, Distance):  # its slope is 1 at most
         found = score.of_values(center) - gain * radius[..., 0] / score.scale
@@ -412,9 +299,7 @@ def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
         inputs = Inputs((center - score.mean) / score.scale, None, radius / score.scale)
         found = gain * lower_bounds(score.net, inputs)[..., 0]
     found = found - ROUNDING * (jnp.abs(found) + 1.0)
-    if not cause.who:
-        return found
-    return jnp.where(cause.holds(center.shape[-2])[:, thing], found, jnp.inf)
+    return jnp.where(cause.holds(center.shape[-3]), found, jnp.inf) if cause.who else found
 
 
 def _braking(dynamics: Dynamics, motion: Motion, x: Array) -> Array:

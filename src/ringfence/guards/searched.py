@@ -21,6 +21,7 @@ from ringfence.world.causes import Cause
 from ringfence.world.cells import Cells
 from ringfence.world.judging import Judging
 from ringfence.world.logged import Logged
+from ringfence.world.quantities import Entry
 
 FEW = 10  # safe steps of what was found, with fewer of which nothing is said
 SURE = 0.8  # probability that being in a cell makes a step unsafe, from which on what was found there counts as wrong
@@ -74,7 +75,7 @@ def _known(logged: Logged) -> list[Cells]:
     names = list(logged.map.names)
     simple = cause_candidates.offsets(names)
     if {"own.x", "own.y"} <= set(names):
-        simple.insert(0, Cause("own.x, own.y", ((names.index("own.x"), names.index("own.y")),)))
+        simple.insert(0, Cause(tuple(Entry((names.index(name),), name) for name in ("own.x", "own.y"))))
     if not simple:
         return []
     steps = np.arange(logged.store.steps)
@@ -88,7 +89,7 @@ def _dangerous(cells: Cells, x: np.ndarray) -> np.ndarray:
     """(W, K) bool: somebody is in a cell that the logs call dangerous, at features (W, K, N, D)."""
     read = cells.cause.of(x)  # (W, K, N, J, width)
     index = np.floor((read - cells.low) / (cells.high - cells.low) * cells.bins).astype(int)
-    inside = (((index >= 0) | cells.cause.length) & (index < cells.bins)).all(-1)  # nearer than ever is as the nearest
+    inside = (((index >= 0) | cells.cause.goes_on) & (index < cells.bins)).all(-1)  # nearer than ever is as the nearest
     index = np.clip(index, 0, cells.bins - 1)
     cell = np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), (cells.bins,) * cells.cause.width)
     return (inside & (cells.danger[cell] > SURE)).any((-1, -2))

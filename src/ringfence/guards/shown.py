@@ -16,7 +16,7 @@ from ringfence.guards.correction import ASKED
 from ringfence.problem.entries import Entries
 from ringfence.types import Array
 from ringfence.world import World, cause_candidates
-from ringfence.world.causes import SLOPED, Cause
+from ringfence.world.causes import Cause
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
@@ -75,7 +75,7 @@ class Shown(eqx.Module):
         is as far outside as it is wide, and never below 0, so that danger that is known counts for more."""
         inside = [self._inside(x)]
         for cause, least, width in self.nearest:
-            inside.append((cause.of(x, SLOPED)[..., 0] - least) / max(width, 1e-6))
+            inside.append((cause.of(x)[..., 0] - least) / max(width, 1e-6))
         return _in_margins(jnp.concatenate(inside, -1).min(-1) + SLACK)
 
     def _inside(self, x: Array) -> Array:

@@ -17,7 +17,6 @@ Sources: gradient penalty, LatentCBF (L4DC 2026), `_margin_gp_step`; in-sample b
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -110,9 +109,8 @@ class Barrier(eqx.Module):
         found: list[tuple[str, str]] = []
         for net in self.causes:
             cause = net.cause
-            kind = re.sub(r"^length of ", "", cause.name).split(".")[0]
-            several = len(cause.things) > 1
-            found += [(cause.name, f"{kind}{j}" if several else "") for j in range(len(cause.things))]
+            several = cause.things > 1
+            found += [(cause.name, f"{cause.kind}{j}" if several else "") for j in range(cause.things)]
         if self.causes:
             return tuple(found)
         if "own" in self.label:

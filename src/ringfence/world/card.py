@@ -387,17 +387,9 @@ def _of_causes(card: Card) -> Iterator[str]:
 
 
 def _edge(cause: Cause, edge: Edge) -> str:
-    if edge.at is None:
+    if edge.at is None or cause.is_rule:  # a rule's words say where
         return ""
-    found = f", {'below' if edge.below else 'above'} {edge.at:.3g}"
-    if cause.how not in ("high", "low", "coming", "ahead") or not edge.below:
-        return found
-    second = cause.second_edge(edge.at)
-    return (
-        f"{found} and within {second:.3g} rad"
-        if cause.how == "ahead"
-        else f"{found} and {'below' if cause.how == 'low' else 'above'} {second:.3g}"
-    )
+    return f", {'below' if edge.below else 'above'} {edge.at:.3g}"
 
 
 def _of_horizon(avoidable: Avoidable, kept: float) -> str:

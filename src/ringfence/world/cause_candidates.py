@@ -1,4 +1,4 @@
-"""Causes that danger may have, as names of entries tell: places, speeds, and how near things are."""
+"""Causes that danger may have, as names of entries tell: what is read together by its types."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import itertools
 import re
 from collections.abc import Iterator, Sequence
 
-from msgspec.structs import replace
-
 from ringfence.problem.entries import LANE, SPACE, Entries, axes_of
-from ringfence.world.causes import Cause, narrowed
+from ringfence.world.causes import Cause
+from ringfence.world.quantities import Closing, Entry, Length, Over, Product, Quantity, Sum, Turned
 
-WIDEST = 4  # entries of one cause
+WIDEST = 4  # numbers of one cause
 ROW = 3  # entries at least that names number
 NAMELESS = ("obs", "state", "entry")  # what numbers alone tell apart is no row
-ORDINALS = ("", "second ", "third ", "fourth ", "fifth ", "sixth ")  # nearest of several things, that causes read
+FARTHEST = 6  # of several things, the so many-th nearest at most
+Fields = list[dict[str, int]]  # entries of each thing, by what they are
 
 
 def candidates(names: Sequence[str]) -> Iterator[Cause]:
@@ -22,8 +22,87 @@ def candidates(names: Sequence[str]) -> Iterator[Cause]:
     yield from _rows(names)
     yield from _sets("", [_own(names)])
     for kind, each in things_of(names).items():
-        yield from _sets(kind, each)
-    yield from (cause for cause in offsets(names) if len(cause.things[0]) > 2)
+        yield from _sets(f"{kind}.", each)
+    yield from (cause for cause in offsets(names) if len(cause.reads[0].parts) > 2)
+
+
+def offsets(names: Sequence[str]) -> list[Cause]:
+    """How far away things are, by kind, as names tell (dx, dy, dz)."""
+    found = []
+    for kind, each in things_of(names).items():
+        if axes := axes_of(each[0]):
+            found.append(Cause((Length(_vector(kind, each, axes)),)))
+    return found
+
+
+def pairs(names: Sequence[str]) -> Iterator[Cause]:
+    """How far things are together with one number more, by kind, where names tell: how fast they come nearer (danger of
+    how soon they meet), or an entry or a vector of oneself or of theirs (near and fast); where they are to who looks
+    into a direction; how far along an axis, and how far across; and both places. And of oneself an entry, or two that
+    are a vector, with how long another vector is: e.g. a place and a speed."""
+    own, several, lone = _own(names), things_of(names), _lone_things(names)
+    known = Entries.of(names)
+    looks = _entries(names, known.direction or known.pair("v{}"))  # who tells no direction looks to where he moves
+    of_lone = {d for each in lone.values() for d in each[0].values()}
+    moving = {name: d for name, d in own.items() if d not in of_lone}
+    for kind, each in (several | lone).items():
+        if axes := axes_of(each[0]):
+            offset = _vector(kind, each, axes)
+            far = Length(offset)
+            second = [*_closing(kind, each, axes, own), *_numbers("", [own if kind in several else moving])]
+            second += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
+            if len(offset) == 2 and looks:
+                second.append(Turned(offset, looks, "angle"))
+                yield Cause((Turned(offset, looks, "ahead"), Turned(offset, looks, "aside")))
+            yield from (Cause((far, one)) for one in second)
+            for k in _apart(offset):
+                yield Cause((Length(tuple(part for part in offset if part is not offset[k])), Length((offset[k],))))
+            if kind in several:
+                yield from _both(offset, axes, own)
+    for one, vector in itertools.product(list(_groups(list(own))), list(_groups(list(own)))):
+        if len(vector) > 1 and len(one) < 3 and not set(one) & set(vector):
+            entries = tuple(Entry((own[name],), name) for name in one)
+            yield Cause((*entries, Length(tuple(Entry((own[name],), name) for name in vector))))
+
+
+def of_several(names: Sequence[str]) -> Iterator[Cause]:
+    """How far away the nearest of several things is, the second nearest, and so on: who is crowded, or alone."""
+    for cause in offsets(names):
+        count = cause.things
+        for k in range(1, min(count, FARTHEST) + 1 if count > 1 else 0):
+            yield Cause((Over(cause.reads[0], "things", k, count),))
+
+
+def of_team(names: Sequence[str]) -> Iterator[Cause]:
+    """Sums over the team of what is each one's own: loads, powers, which are a force times a speed."""
+    own = _own(names)
+    numbers = _numbers("", [own])
+    entries = [one for one in numbers if isinstance(one, Entry)]
+    numbers += [Length((one,)) for one in entries]
+    numbers += [Product(both) for both in itertools.combinations_with_replacement(entries, 2)]
+    yield from (Cause((Over(one, "team"),)) for one in numbers)
+
+
+def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
+    """The cause with one more entry of oneself, or of the same thing; of whom it is."""
+    reads = cause.reads if cause.vector is None else cause.vector
+    if len(reads) >= WIDEST or any(not isinstance(one, Entry) for one in reads):
+        return
+    known = {leaf.at for leaf in reads}
+    for name, d in _own(names).items():
+        if (d,) not in known:
+            yield Cause((*reads, Entry((d,), name)), cause.who)
+    for kind, each in things_of(names).items():
+        for field in each[0]:
+            entry = Entry(tuple(fields[field] for fields in each), f"{kind}.{field}")
+            if len(each) == cause.things and entry.at not in known and _of_these(each, reads):
+                yield Cause((*reads, entry), cause.who)
+
+
+def _of_these(each: Fields, reads: Sequence[Quantity]) -> bool:
+    """Whether some of the entries are those of things."""
+    inside = {tuple(fields[field] for fields in each) for field in each[0]}
+    return any(isinstance(one, Entry) and one.at in inside for one in reads)
 
 
 def _rows(names: Sequence[str]) -> Iterator[Cause]:
@@ -35,99 +114,44 @@ def _rows(names: Sequence[str]) -> Iterator[Cause]:
             found.setdefault(match[1], []).append((int(match[2]), d))
     for name, row in found.items():
         if len(row) >= ROW:
-            entries = tuple((d,) for _, d in sorted(row))
-            yield Cause(name, entries)
-            yield Cause(name, entries, length=True)
+            entry = Entry(tuple(d for _, d in sorted(row)), name)
+            yield Cause((entry,))
+            yield Cause((Length((entry,)),))
 
 
-def offsets(names: Sequence[str]) -> list[Cause]:
-    """How far away things are, by kind, as names tell (dx, dy, dz)."""
-    found = []
-    for kind, each in things_of(names).items():
-        if axes := [f"d{c}" for c in axes_of(each[0])]:
-            found.append(Cause(f"length of {kind}.{', '.join(axes)}", _picked(each, axes), length=True))
-    return found
-
-
-def with_distances(names: Sequence[str]) -> list[Cause]:
-    """How far things are together with one number more, by kind, where names tell: how fast they come nearer (danger of
-    how soon they meet), or an entry or a vector of oneself or of theirs (near and fast). And where they are to who
-    looks into a direction."""
-    found: list[Cause] = []
-    own, several, lone = _own(names), things_of(names), _lone_things(names)
-    known = Entries.of(names)
-    looks = known.direction or known.pair("v{}")  # who tells no direction looks to where he moves
-    of_lone = {d for each in lone.values() for d in each[0].values()}
-    moving = {name: d for name, d in own.items() if d not in of_lone}
-    for kind, each in (several | lone).items():
-        axes = axes_of(each[0])
-        if axes:
-            offset = Cause(f"{kind}.distance", _picked(each, [f"d{c}" for c in axes]))
-            found += _nearing(offset, each, axes, own)
-            found += _turned(offset, kind, looks)
-            found += _beside(offset, [own if kind in several else moving] * len(each))
-            theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
-            found += _beside(offset, theirs)
-        if kind in several:
-            found += _both(kind, each, axes, own)
-    return found
-
-
-def _nearing(offset: Cause, each: Sequence[dict[str, int]], axes: str, own: dict[str, int]) -> Iterator[Cause]:
-    """How far things are, and how fast that shrinks: by their velocity, or of what logs none by one's own."""
+def _closing(kind: str, each: Fields, axes: str, own: dict[str, int]) -> Iterator[Quantity]:
+    """How fast things come nearer: by their velocity, or of what logs none by one's own."""
+    offset = _vector(kind, each, axes)
     theirs, mine = [f"dv{c}" for c in axes], [f"own.v{c}" for c in axes]
-    name = f"{offset.name}, how fast it shrinks"
     if set(theirs) <= set(each[0]):
-        yield replace(offset, name=name, also=_picked(each, theirs), how="nearing")
+        yield Closing(offset, tuple(_entry(kind, each, name) for name in theirs))
     elif set(mine) <= set(own):
-        yield replace(offset, name=name, also=_picked([own] * len(each), mine), how="nearing", against=True)
+        yield Closing(offset, tuple(Sum((Entry((own[name],), name),), (-1.0,)) for name in mine))
 
 
-def _turned(offset: Cause, kind: str, looks: tuple[int, ...]) -> Iterator[Cause]:
-    """How far ahead things in a plane are, and how far aside."""
-    if len(offset.things[0]) == 2 and looks:
-        also = (looks,) * len(offset.things)
-        yield replace(offset, name=f"{kind}.ahead, {kind}.aside", also=also, how="turned")
-
-
-def _both(kind: str, each: Sequence[dict[str, int]], axes: str, own: dict[str, int]) -> Iterator[Cause]:
+def _both(offset: tuple[Entry, ...], axes: str, own: dict[str, int]) -> Iterator[Cause]:
     """Where one is, and where things are: what has room for one is dangerous for two."""
-    place = [f"own.{c}" for c in axes]
-    if set(place) <= set(own) and 0 < 2 * len(axes) <= WIDEST:
-        offset = _picked(each, [f"d{c}" for c in axes])
-        yield Cause(f"{kind}.place, own.place", offset, also=_picked([own] * len(each), place), how="both")
+    names = [f"own.{c}" for c in axes]
+    if set(names) <= set(own) and 2 * len(axes) <= WIDEST:
+        place = tuple(Entry((own[name],), name) for name in names)
+        yield Cause((*place, *(Sum((mine, far), (1.0, 1.0)) for mine, far in zip(place, offset))))
 
 
-def _beside(offset: Cause, fields: Sequence[dict[str, int]]) -> Iterator[Cause]:
-    """How far things are, and a number more: of these fields, or how long several are as a vector."""
-    for group in _numbers(list(fields[0])):
-        number = ("length of " if len(group) > 1 else "") + ", ".join(group)
-        yield replace(offset, name=f"{offset.name}, {number}", also=_picked(fields, group), how="beside")
+def _apart(offset: Sequence[Entry]) -> Sequence[int]:
+    """Which axes may count by themselves; of two, one by itself leaves the other so, too."""
+    return range(len(offset)) if len(offset) > 2 else range(1, len(offset))
 
 
-def of_several(names: Sequence[str]) -> Iterator[Cause]:
-    """How far away the nearest of several things is, the second nearest, and so on: who is crowded, or alone."""
-    for cause in offsets(names):
-        count = len(cause.things)
-        kind = cause.name.removeprefix("length of ").split(".")[0]
-        for k, ordinal in enumerate(ORDINALS[:count] if count > 1 else (), 1):
-            name = f"{kind}.distance of the {ordinal}nearest"
-            yield replace(cause, name=name, things=(sum(cause.things, ()),), nearest=(k, count))
+def _vector(kind: str, each: Fields, axes: str) -> tuple[Entry, ...]:
+    return tuple(_entry(kind, each, f"d{c}") for c in axes)
 
 
-def with_vectors(names: Sequence[str]) -> Iterator[Cause]:
-    """An entry of oneself, or two that are a vector, with how long another vector is: e.g. a place and a speed."""
-    own = _own(names)
-    groups = list(_numbers(list(own)))
-    for base, vector in itertools.product(groups, groups):
-        if len(vector) > 1 and len(base) < 3 and not set(base) & set(vector):
-            name = f"{', '.join(base)}, length of {', '.join(vector)}"
-            yield Cause(name, _picked([own], base), also=_picked([own], vector), how="vector")
+def _entry(kind: str, each: Fields, field: str) -> Entry:
+    return Entry(tuple(fields[field] for fields in each), f"{kind}.{field}")
 
 
-def _picked(things: Sequence[dict[str, int]], fields: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """(J, k) entries of these fields of each thing."""
-    return tuple(tuple(thing[field] for field in fields) for thing in things)
+def _entries(names: Sequence[str], at: Sequence[int]) -> tuple[Entry, ...]:
+    return tuple(Entry((d,), names[d]) for d in at)
 
 
 def _own(names: Sequence[str]) -> dict[str, int]:
@@ -136,28 +160,7 @@ def _own(names: Sequence[str]) -> dict[str, int]:
     return {name: d for d, name in enumerate(names) if d not in inside}
 
 
-def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
-    """The cause with one more entry of oneself, or of the same thing; of whom it is."""
-    if len(cause.things[0]) < WIDEST and cause.apart is None and not cause.also:
-        base = narrowed(cause, ())
-        base = replace(base, length=False, name=base.name.removeprefix("length of "))
-        yield from (narrowed(more, cause.who) for more in _with_one_more(base, names))
-
-
-def _with_one_more(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
-    for name, d in _own(names).items():
-        if d not in cause.things[0]:
-            yield replace(cause, name=f"{cause.name}, {name}", things=tuple((*t, d) for t in cause.things))
-    for kind, each in things_of(names).items():
-        if len(each) != len(cause.things) or not set(cause.things[0]) & set(each[0].values()):
-            continue
-        for field in each[0]:
-            if each[0][field] not in cause.things[0]:
-                more = tuple((*t, thing[field]) for t, thing in zip(cause.things, each))
-                yield replace(cause, name=f"{cause.name}, {kind}.{field}", things=more)
-
-
-def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
+def things_of(names: Sequence[str]) -> dict[str, Fields]:
     """Fields of each thing, by kind: those that all of a kind have."""
     kinds = {}
     for kind, things in Entries.of(names).numbered.items():
@@ -167,27 +170,34 @@ def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
     return kinds
 
 
-def _lone_things(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
+def _lone_things(names: Sequence[str]) -> dict[str, Fields]:
     """Likewise things that no number tells from others of their kind, e.g. a goal: each is a kind of one."""
-    kinds: dict[str, list[dict[str, int]]] = {}
+    kinds: dict[str, Fields] = {}
     for e in Entries.of(names).each:
         if e.order is None and e.role in ("offset", "drift"):
             kinds.setdefault(e.whose, [{}])[0][e.what] = e.source
     return kinds
 
 
-def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
-    fields = list(each[0])
-    of = f"{kind}." if kind else ""
-    for field in fields:
-        yield Cause(of + field, tuple((thing[field],) for thing in each))
-    for one, two in itertools.combinations(fields, 2):
-        both = tuple((thing[one], thing[two]) for thing in each)
-        yield Cause(f"{of}{one}, {of}{two}", both)
-        yield Cause(f"length of {of}{one}, {of}{two}", both, length=True)
+def _sets(of: str, each: Fields) -> Iterator[Cause]:
+    entries = [Entry(tuple(fields[field] for fields in each), of + field) for field in each[0]]
+    for one in entries:
+        yield Cause((one,))
+    for both in itertools.combinations(entries, 2):
+        yield Cause(both)
+        yield Cause((Length(both),))
 
 
-def _numbers(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def _numbers(of: str, each: Fields) -> list[Quantity]:
+    """Each field, and how long those are that make a vector."""
+    found: list[Quantity] = []
+    for group in _groups(list(each[0])):
+        entries = tuple(Entry(tuple(fields[field] for fields in each), of + field) for field in group)
+        found.append(Length(entries) if len(entries) > 1 else entries[0])
+    return found
+
+
+def _groups(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Each by itself, and those that are a vector: they differ in the axis at the end alone."""
     yield from ((name,) for name in names)
     axes: dict[tuple[str, str], list[str]] = {}

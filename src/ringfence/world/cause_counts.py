@@ -16,6 +16,7 @@ import numpy as np
 
 from ringfence.world.causes import Cause, Edge, narrowed
 from ringfence.world.cells import CELLS, Cells
+from ringfence.world.quantities import Entry, from_zero
 
 UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
 SAFE_STEPS = 120_000  # likewise
@@ -77,10 +78,7 @@ class Steps:
 
     def vary(self, cause: Cause) -> np.ndarray:
         """(N, J) bool: of which agents and things all that a cause reads varies."""
-        read = np.array(cause.things)
-        if cause.also:
-            read = np.concatenate([read, np.array(cause.also)], -1)
-        return np.all(self.varies[:, read], -1)
+        return cause.varies(self.varies)
 
     def part(self, some: np.ndarray) -> Steps:
         """Those of the steps, `some` (T,) bool."""
@@ -117,7 +115,7 @@ class Counted:
         if not self.others.any():
             return np.zeros(self.safe.shape, bool)
         unsafe = self.safe < np.log(0.5)
-        return unsafe if self.cause.length else unsafe | self._any_in(~self.visited)
+        return unsafe if self.cause.goes_on else unsafe | self._any_in(~self.visited)
 
     @cached_property
     def near(self) -> np.ndarray:
@@ -244,12 +242,14 @@ def likelihood(steps: Steps, safe: np.ndarray) -> np.ndarray:
 
 
 def _range(steps: Steps, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
-    entries = np.array(cause.things)
-    if not cause.length and not cause.also:
-        return steps.low[entries].min(0), steps.high[entries].max(0)
+    at = [list(read.at) for read in cause.reads if isinstance(read, Entry)]
+    if len(at) == cause.width:
+        return np.array([steps.low[d].min() for d in at]), np.array([steps.high[d].max() for d in at])
     some = cause.of(steps.x[:: max(1, len(steps.x) // 20_000)])
     low, high = np.quantile(some, [0.0005, 0.9995], axis=tuple(range(some.ndim - 1)))
-    return (np.array([0.0, *low[1:]]) if cause.first_is_distance else low), high
+    if cause.is_rule:  # what is in danger is rare
+        low = np.asarray(cause.of(steps.x).min(), float)[None]
+    return np.array([0.0 if from_zero(read) else least for read, least in zip(cause.reads, low)]), high
 
 
 def _bins(cause: Cause, samples: int) -> int:
@@ -279,11 +279,13 @@ def radius(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, cause: Cause)
 
 def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edge:
     """The edge with bounds between the values that parted unsafe steps from safe ones, finer than cells are."""
+    if cause.is_rule and edge.bounds:  # its conditions say where
+        return msgspec.structs.replace(edge, at=0.0, below=True, bounds=(0.0,), inside=True, unseen=(False,))
     if not edge.bounds:
         return edge
     agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
     values = cause.of(steps.x)[:, agents, things, 0]
-    value = _of_the_worst(steps, values, signed(values, edge), agents)
+    value = of_the_worst(steps, values, signed(values, edge), agents)
     left = explained.left > 0.5
     size = (edge.high[0] - edge.low[0]) / CELLS[1]
     bounds = list(edge.bounds)
@@ -304,7 +306,7 @@ def signed(values: np.ndarray, edge: Edge) -> np.ndarray:
     return np.where(safe, 1.0, -1.0) * np.abs(offset).min(-1)
 
 
-def _of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: np.ndarray) -> np.ndarray:
+def of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: np.ndarray) -> np.ndarray:
     """(T,) or (T, N) the values of the things in most danger; far off where an agent has none."""
     if not steps.each:
         return np.take_along_axis(values, score.argmin(1)[:, None], 1)[:, 0]
@@ -315,15 +317,7 @@ def _of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: n
     return found
 
 
-def least_wrong(steps: Steps, cause: Cause) -> int:
-    """How many steps a distance tells wrongly, by the edge below which danger begins that tells fewest so."""
-    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
-    values = cause.of(steps.x)[:, agents, things, 0]
-    nearest = _of_the_worst(steps, values, values, agents)
-    return int(_wrong(np.sort(nearest[steps.unsafe]), np.sort(nearest[~steps.unsafe]))[1].min())
-
-
-def _wrong(bad: np.ndarray, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def told_wrong(bad: np.ndarray, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(values, how many of bad and fine ones, which are sorted, an edge at each tells wrongly where low is bad)."""
     tried = np.unique(np.concatenate([bad, fine]))
     return tried, len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
@@ -332,7 +326,7 @@ def _wrong(bad: np.ndarray, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _parting(bad: np.ndarray, fine: np.ndarray, low_is_bad: bool) -> float:
     """The value that parts most unsafe steps from safe ones: in the middle of all that do as well."""
     sign = 1.0 if low_is_bad else -1.0
-    tried, wrong = _wrong(np.sort(sign * bad), np.sort(sign * fine))
+    tried, wrong = told_wrong(np.sort(sign * bad), np.sort(sign * fine))
     best = int(wrong.argmin())
     following = tried[best + 1] if best + 1 < len(tried) else tried[best]
     return float(sign * 0.5 * (tried[best] + following))
@@ -342,4 +336,4 @@ def within(steps: Steps, cause: Cause, edge: Edge) -> np.ndarray:
     """(T,) or (T, N) bool: somebody is in danger by a cause of one number."""
     agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
     score = signed(cause.of(steps.x)[:, agents, things, 0], edge)
-    return _of_the_worst(steps, score, score, agents) < 0
+    return of_the_worst(steps, score, score, agents) < 0

@@ -23,7 +23,7 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.causes import SLOPED, Cause, Edge, Found
+from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import CELLS, Cells
 from ringfence.world.settings import Settings
 
@@ -79,7 +79,7 @@ Labelled = tuple[Array, Array, Array, Array]
 
 def scores(net: Score, x: Array) -> Array:
     """(..., N, J) of features (..., N, D), by thing; FAR of those that the cause is not about."""
-    found = net.of_values(net.cause.of(x, SLOPED))
+    found = net.of_values(net.cause.of(x))
     if not net.cause.who:
         return found
     return jnp.where(net.cause.holds(x.shape[-2]), found, FAR)

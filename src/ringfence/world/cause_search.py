@@ -13,44 +13,27 @@ This is a noisy-or over causes and agents (Pearl 1988), grown greedily: P(safe) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.cause_candidates import (
-    candidates,
-    of_several,
-    offsets,
-    wider,
-    with_distances,
-    with_vectors,
-)
+from ringfence.world.cause_candidates import candidates, of_several, of_team, pairs, wider
 from ringfence.world.cause_counts import (
     Counted,
     Explained,
     Steps,
     counted,
     gain,
-    least_wrong,
     likelihood,
     refined,
     some_steps,
     within,
 )
-from ringfence.world.causes import (
-    Cause,
-    Edge,
-    Found,
-    How,
-    in_one_number,
-    narrowed,
-    only_of,
-    only_where,
-    with_an_axis_apart,
-)
+from ringfence.world.causes import Cause, Edge, Found, narrowed, only_of, only_where
 from ringfence.world.cells import CELLS, Cells
+from ringfence.world.quantities import Entry, Length, Over
+from ringfence.world.rules import rules_of
 
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
@@ -61,20 +44,17 @@ PURE = 0.8  # share of the steps that a cause calls unsafe, and that are, of one
 ENOUGH = 0.98  # share of unsafe steps, and of safe ones, that causes tell, from which on nothing else is tried
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
-RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which an axis is tried to count more or less, ever finer
-TRIED = (8, 3, 3, 3)  # such factors to either side
-RATIO_STEPS = 40_000  # steps that a ratio is looked for in
 ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too
 EPISODES = 2  # in which they have to be: one alone may be an accident
 
 
 def find(
-    x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, names: Sequence[str], seed: int = 0
+    x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, names: Sequence[str], seed: int = 0, team: bool = True
 ) -> tuple[Found, list[Cells]]:
     """The causes of danger in steps that led to features x (T, N, D), `unsafe` (T,) of the team or (T, N) bool of each
     agent, of these episodes (T,); with the cells of each cause."""
     steps = some_steps(x, unsafe, episode, np.random.default_rng([seed, 5]))
-    chosen = _with_more_shapes(steps, _split(steps, _best_grown(steps, names), names), names)
+    chosen = _with_more_shapes(steps, _split(steps, _best_grown(steps, names), names), names, team)
     if not chosen:
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
@@ -100,22 +80,20 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
     return pure if more - less > SURE * error else chosen
 
 
-def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
+def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str], team: bool) -> list[Counted]:
     """The causes, or those that are found with more that may be read, where these tell more. Aircraft are too near
     where they are near across and in height, vehicles where they are along and aside, or near and fast; what is ahead
     is in danger, or what would meet soon; or who is fast in some place."""
     if _tell_enough(steps, chosen):
         return chosen
-    some = steps.part(np.arange(len(steps.x)) % max(1, len(steps.x) // RATIO_STEPS) == 0)
-    apart = [_axis_apart(some, one, axis) for one in _about_whom(steps, offsets(names)) for axis in _axes_apart(one)]
     several = [one for one in _about_whom(steps, of_several(names)) if _is_of_several(steps, one)]
-    shapes = [*apart, *_about_whom(steps, [*with_distances(names), *with_vectors(names)]), *several]
+    shapes = [*_about_whom(steps, pairs(names)), *several, *(_about_whom(steps, of_team(names)) if team else ())]
     found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
     if not {one.cause for one in found} & set(shapes):
         return chosen
     for k, one in enumerate(found):
-        found[k] = _in_one_number(steps, some, one, _without(steps, found, one))
+        found[k] = _as_rule(steps, one, shapes, _without(steps, found, one)) if one.cause.width > 1 else one
     found = _pruned(steps, found)
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
@@ -125,9 +103,10 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str])
 def _is_of_several(steps: Steps, cause: Cause) -> bool:
     """Whether the distance of the k-th nearest tells what that of each does not: that of the nearest does so where it
     is dangerous to be far from all, and that of the farthest where it is to be near all."""
-    k, count = cause.nearest or (0, 0)
+    (read,) = cause.reads
+    assert isinstance(read, Over)
     below = counted(steps, cause, Explained.by(steps, [])).cells.edge.below
-    return k > 1 if below else k < count
+    return read.rank > 1 if below else read.rank < read.count
 
 
 def _tell_enough(steps: Steps, chosen: list[Counted]) -> bool:
@@ -136,47 +115,21 @@ def _tell_enough(steps: Steps, chosen: list[Counted]) -> bool:
     return min(told.explained, 1.0 - told.false_alarms) > ENOUGH
 
 
-def _axes_apart(length: Cause) -> Sequence[int]:
-    """Which axes are tried to count by themselves; of two, one by itself leaves the other so, too."""
-    axes = len(length.things[0])
-    return range(axes) if axes > 2 else range(1, axes)
-
-
-def _axis_apart(steps: Steps, length: Cause, axis: int) -> Cause:
-    """The length with an axis apart that counts as much as parts most unsafe steps from safe ones."""
-    read = np.abs(steps.x[..., np.array(length.things)]).reshape(-1, len(length.things[0]))
-    most = np.maximum(np.quantile(read, 0.9995, axis=0), 1e-9)
-    ratio = np.delete(most, axis).max() / most[axis]
-    return _with_ratio(steps, partial(with_an_axis_apart, length, axis), ratio)
-
-
-def _in_one_number(steps: Steps, some: Steps, one: Counted, explained: Explained) -> Counted:
-    """A cause of a distance and another number in one, near *and* fast or in sight, or near soon, where this tells
-    as much: then its edges are known as well as those of a distance are."""
-    sides: dict[str, tuple[How, ...]] = {"beside": ("high", "low"), "turned": ("ahead",), "nearing": ("soon", "coming")}
+def _as_rule(steps: Steps, one: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
+    """A cause of several numbers as a rule, near *and* fast or in sight, or near soon, where this tells as much: then
+    its edges are known as well as those of a distance are. So are others that read the same entries."""
+    about = one.cause.entries()
+    alike = [counted(steps, cause, explained) for cause in pool if cause.width > 1 and cause.entries() == about]
     best = counted(steps, one.cause, explained)
     least = (1 - SIMPLER) * best.gain
-    for how in sides.get(one.cause.how, ()):
-        far, second = some.x[..., np.array(one.cause.things)], one.cause.of(some.x)[..., 1]
-        end = float(second.min() if how == "low" else second.max())
-        wide = np.pi if how == "ahead" else second.max() - second.min()
-        ratio = np.quantile(np.sqrt((far**2).sum(-1)), 0.9995) / max(wide, 1e-9)
-        cause = _with_ratio(some, partial(in_one_number, one.cause, how, end), ratio)
-        tried = counted(steps, cause, explained)
-        if tried.gain > least:
-            best, least = tried, tried.gain
+    for other in [best, *alike]:
+        if other.gain < least:
+            continue
+        for rule in rules_of(steps, other, explained):
+            tried = counted(steps, rule, explained)
+            if tried.gain > least:
+                best, least = tried, tried.gain
     return best
-
-
-def _with_ratio(steps: Steps, made: Callable[[float], Cause], ratio: float) -> Cause:
-    """The cause of the ratio that parts most unsafe steps from safe ones, from one that makes both numbers as long."""
-    ratio = float(ratio)
-    for factor, either in zip(RATIOS, TRIED):
-        tried = [made(ratio * factor**k) for k in range(-either, either + 1)]
-        wrong = np.array([least_wrong(steps, one) for one in tried])
-        best = np.flatnonzero(wrong == wrong.min())
-        ratio = tried[best[len(best) // 2]].ratio
-    return made(ratio)
 
 
 def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
@@ -199,9 +152,9 @@ def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Co
 
 def _of_fewer_entries(steps: Steps, cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     """Causes of some of the entries of one, of all agents for whom these vary, and of each."""
-    whole = {frozenset(thing) for thing in cause.things}
+    whole = set(cause.entries())
     for fewer in candidates(names):
-        if fewer.length or not all(any(set(thing) < every for every in whole) for thing in fewer.things):
+        if fewer.goes_on or not all(any(thing < every for every in whole) for thing in fewer.entries()):
             continue
         vary = steps.vary(fewer)
         if vary.all():
@@ -229,7 +182,7 @@ def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
     pool = list(_about_whom(steps, candidates(names)))
     alone = [one for cause in pool for one in only_of(cause, steps.x.shape[1])]
     chosen: list[Counted] = []
-    for fits in (lambda cause: cause.width == 1 and not cause.length, lambda cause: cause.width == 1, lambda _: True):
+    for fits in (lambda cause: cause.width == 1 and not cause.goes_on, lambda cause: cause.width == 1, lambda _: True):
         chosen = _added(steps, chosen, [cause for cause in (*pool, *alone) if fits(cause)], PURE)
     chosen = _pruned(steps, chosen)
     for k, one in enumerate(chosen):
@@ -265,7 +218,8 @@ def _simplified(steps: Steps, chosen: list[Counted], pool: Sequence[Cause]) -> l
     was found later, too."""
     for k, one in enumerate(chosen):
         if not one.cause.who:
-            related = [cause for cause in pool if set(cause.things[0]) <= set(one.cause.things[0])]
+            about = one.cause.entries()[0]
+            related = [cause for cause in pool if cause.entries()[0] <= about]
             chosen[k] = _simplest(steps, related, _without(steps, chosen, one)) or one
     return chosen
 
@@ -306,9 +260,7 @@ def _tells_nearly_all(steps: Steps, one: Counted, explained: Explained) -> bool:
 
 def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
     """The cause of a single agent as one of all for whom it holds likewise, one after the other."""
-    things = best.cause.things
-    length = best.cause.length
-    others = [cause for cause in pool if cause.who and cause.things == things and cause.length == length]
+    others = [cause for cause in pool if cause.who and cause.reads == best.cause.reads]
     for other in sorted(others, key=lambda cause: -counted(steps, cause, explained).gain):
         who = best.cause.who
         if other.who[0] in who:
@@ -341,7 +293,8 @@ def _simplest(steps: Steps, pool: Sequence[Cause], explained: Explained, pure: f
 
 def _complexity(cause: Cause) -> tuple[int, bool, bool, bool]:
     """Of causes that tell as much, the one of which this is least is taken."""
-    return cause.width, not cause.length, cause.apart is not None or cause.nearest is not None, bool(cause.who)
+    simple = all(isinstance(read, (Entry, Length)) for read in cause.reads)
+    return cause.width, not cause.goes_on, not simple, bool(cause.who)
 
 
 def _gain_if(steps: Steps, one: Counted, pure: float) -> float:
@@ -417,7 +370,7 @@ def _siblings(
 
 def _is_plain(cause: Cause) -> bool:
     """Whether it is one entry, of all agents."""
-    return cause.width == 1 and not cause.length and not cause.who
+    return isinstance(cause.reads[0], Entry) and cause.width == 1 and not cause.who
 
 
 def _between(edge: Edge) -> bool:

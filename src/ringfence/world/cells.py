@@ -47,12 +47,12 @@ class Cells:
         bounds = [float(self.low[0] + k * self.size) for k in turns]
         unseen = [False] * len(bounds)
         inside = bool(unsafe[0])
-        at = round(bounds[0], 4) if len(bounds) == 1 or (bounds and self.cause.length) else None
-        if not self.cause.length and not unsafe[0]:
+        at = round(bounds[0], 4) if len(bounds) == 1 or (bounds and self.cause.goes_on) else None
+        if not self.cause.goes_on and not unsafe[0]:
             bounds.insert(0, float(self.low[0] - self.size))
             unseen.insert(0, True)
             inside = True
-        if not self.cause.length and not unsafe[-1]:
+        if not self.cause.goes_on and not unsafe[-1]:
             bounds.append(float(self.high[0] + self.size))
             unseen.append(True)
         return Edge(low, high, at, bool(unsafe[0]), tuple(bounds), inside, tuple(unseen))
@@ -76,7 +76,7 @@ class Cells:
         turn = min(most, share * called_safe.sum())
         called_safe = np.where(known, called_safe, 1e-3 * like)
         called_unsafe = np.where(known, called_unsafe, 1e-3 * ~like)
-        if not self.cause.length:
+        if not self.cause.goes_on:
             called_safe = np.where(far, 3 * turn, called_safe)
         return _likeliest(np.stack([called_safe, called_unsafe], -1), turn)
 
@@ -97,7 +97,7 @@ class Cells:
         if not len(new):
             new = np.arange(count)
         values, far, nearest = (a[np.resize(new, count)] for a in (values, far, nearest))
-        if self.cause.first_is_distance:
+        if self.cause.from_zero:
             scale = scale * [1 / ALONG, *[1.0] * (self.cause.width - 1)]
             nearest = np.asarray(KDTree(centres / scale).query(values / scale)[1])
             far = np.abs((values - centres[nearest]) / scale)[:, 1:].max(1, initial=0.0)
@@ -110,7 +110,7 @@ class Cells:
         close = centres[rng.integers(len(centres), size=count - count // 2)]
         close = close + scale * rng.normal(0.0, NEARBY, close.shape)
         values = np.concatenate([anywhere, close])[rng.permutation(count)]
-        if self.cause.first_is_distance:
+        if self.cause.from_zero:
             values[:, 0] = np.maximum(values[:, 0], 0.0)
         return values
 

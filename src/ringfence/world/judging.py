@@ -46,6 +46,7 @@ from ringfence.world.margins import (
     widening,
 )
 from ringfence.world.model import World
+from ringfence.world.quantities import Entry
 from ringfence.world.values import Values
 
 SCORED = 20_000  # steps that are scored at once
@@ -250,14 +251,14 @@ def _reads(barrier: Barrier | MinBarrier, names: Sequence[str]) -> dict[str, tup
             found |= {_name(net.cause, net.edge): (net.cause, net.edge) for net in one.causes}
             continue
         offsets = cause_candidates.offsets(names)
-        inside = {d for cause in offsets for thing in cause.things for d in thing}
+        inside = {d for cause in offsets for thing in cause.entries() for d in thing}
         found |= {_name(cause, None): (cause, None) for cause in offsets}
-        found |= {name: (Cause(name, ((d,),)), None) for d, name in enumerate(names) if d not in inside}
+        found |= {name: (Cause((Entry((d,), name),)), None) for d, name in enumerate(names) if d not in inside}
     return found
 
 
 def _name(cause: Cause, edge: Edge | None) -> str:
-    if not cause.length or len(cause.things) == 1:
+    if not cause.goes_on or cause.things == 1:
         return cause.name
     return f"{cause.name}, of the {'farthest' if _farther_is_worse(edge) else 'nearest'}"
 
@@ -271,7 +272,7 @@ def _read(x: np.ndarray, cause: Cause, edge: Edge | None) -> np.ndarray:
     danger: which of them is listed where may change."""
     read = np.moveaxis(cause.of(x), 1, 0)  # (K, W, N, J, width)
     held = cause.holds(x.shape[2])
-    if not cause.length:
+    if not cause.goes_on:
         return np.swapaxes(read[:, :, held].reshape(len(read), -1, cause.width), 0, 1)
     sign = -1.0 if _farther_is_worse(edge) else 1.0
     worst = np.where(held, sign * read[..., 0], np.inf).min(-1)[:, :, held.any(1)]

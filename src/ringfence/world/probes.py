@@ -74,9 +74,9 @@ def _curve(net: Score, unit: float) -> Probe:
     """Scores of a cause that reads one number, along it; of a distance from 0 to well beyond where danger begins."""
     edge = net.edge
     reach = 0.25 * (edge.high[0] - edge.low[0])
-    low = max(0.0, edge.low[0] - reach) if net.cause.first_is_distance else edge.low[0] - reach
+    low = max(0.0, edge.low[0] - reach) if net.cause.from_zero else edge.low[0] - reach
     high = edge.high[0] + reach
-    if net.cause.is_distance and edge.at:
+    if net.cause.vector and edge.at:
         low, high = 0.0, min(high, FARTHEST * edge.at)
     at = np.linspace(low, high, POINTS)
     scores = np.asarray(_scores_of_values(net, at[:, None].astype(np.float32))) / unit
@@ -152,7 +152,7 @@ def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Ed
     """How near things come: the causes that are a distance, or, of networks on all entries, what names tell of one."""
     nets = [net for one in barrier.each for net in one.causes]
     if nets:
-        return [(net.cause, net.edge) for net in nets if net.cause.is_distance]
+        return [(net.cause, net.edge) for net in nets if net.cause.vector]
     steps = logged.fitted_steps
     told = logged.after(steps), logged.label[steps], logged.store.episode_of_step[steps]
     return [(cause, cause_counts.radius(*told, cause)) for cause in cause_candidates.offsets(logged.map.names)]
@@ -164,7 +164,7 @@ def _put(
     """(1 or 2, W) scores of the first agent that the cause is about, with its thing at that distance: at rest, and
     closing where names tell its velocity."""
     agent, thing = cause.who[0] if cause.who else (0, 0)
-    place = np.array(cause.things[thing])
+    place = np.array([entry.at[thing] for entry in cause.vector or ()])
     offset = states[:, agent, place]
     length = np.maximum(np.sqrt((offset**2).sum(-1, keepdims=True)), 1e-6)
     direction = offset / length

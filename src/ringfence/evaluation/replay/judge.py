@@ -395,14 +395,13 @@ def _radius_of_costs(store: EpisodeStore, motion: Motion) -> float:
 
 def _radius_of_causes(causes: Mapping[str, Found], axes: int) -> tuple[float, str] | None:
     """(m, where it is from): below what distance to any other the logs of a World have danger, where it found one."""
-    offsets = [f"d{axis}" for axis in "xyz"[:axes]]
+    offsets = [f"other.d{axis}" for axis in "xyz"[:axes]]
     likely = sorted(
         (share, edge.at, cause.name)
         for found in causes.values()
         for cause, share, edge in zip(found.causes, found.shares, found.edges)
-        if cause.is_distance and not cause.who and edge.at is not None and edge.below
-        if cause.name.startswith("length of other.")
-        if cause.name.removeprefix("length of ").replace("other.", "").split(", ") == offsets
+        if not cause.who and edge.at is not None and edge.below
+        if [entry.name for entry in cause.vector or ()] == offsets
     )
     if not likely:
         return None

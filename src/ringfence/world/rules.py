@@ -1,0 +1,176 @@
+"""Rules: a cause of several numbers as conditions that hold together, whose thresholds are known as well as the edge of
+a distance is: near and fast, along and aside, near soon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, told_wrong
+from ringfence.world.causes import Cause
+from ringfence.world.cells import VISITED, Cells
+from ringfence.world.quantities import All, Quantity, Sum
+
+SWEEPS = 4  # in which every threshold is looked for in turn
+MOST_READ = 20_000_000  # numbers that a rule is looked for in
+STRAY = 0.02  # share of the danger that may lie outside of the box that a rule begins with
+NEEDLESS = 0.002  # share of the unsafe steps by which a condition has to make fewer wrong
+RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tried to be more or less, ever finer
+TRIED = (10, 3, 3, 3)  # such factors to either side
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """What a cause reads in steps, in ranges of each number."""
+
+    steps: Steps
+    values: np.ndarray  # (T, P, K)
+    agents: np.ndarray  # (P,)
+    bad: np.ndarray  # (T,) or (T, N) bool: unsafe and not explained
+    fine: np.ndarray
+
+    def wrong(self, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(values to part at, steps that each tells wrongly) of scores (T, P), low in danger."""
+        worst = of_the_worst(self.steps, score, score, self.agents)
+        tried, wrong = told_wrong(np.sort(worst[self.bad]), np.sort(worst[self.fine]))
+        kept = np.isfinite(tried)
+        return tried[kept], wrong[kept]
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A condition: `sign` times a number is below `at`."""
+
+    number: int
+    sign: float
+    at: float
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        return self.sign * values[..., self.number] - self.at
+
+
+def rules_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause]:
+    """The cause as rules, by the steps that others leave unexplained: a box around its danger, and of two numbers a
+    line."""
+    cause = one.cause
+    read, scale = _read(steps, one, explained)
+    if not read.bad.any():
+        return
+    sides = _fitted(read, _box(one.cells, scale))
+    units = scale[sides[0].number] / scale if sides else scale
+    if len(sides) > 1:
+        yield replace_reads(cause, All(tuple(_condition(cause.reads, side, scale, units) for side in sides)))
+    if cause.width == 2:
+        line = _line(read, one.cells)
+        if line is not None:
+            sign, weight, at = line
+            weights = sign[0], float(sign[1] * weight * scale[0] / scale[1])
+            yield replace_reads(cause, Sum(cause.reads, weights, -float(at * scale[0])))
+
+
+def replace_reads(cause: Cause, read: Quantity) -> Cause:
+    return Cause((read,), cause.who)
+
+
+def _read(steps: Steps, one: Counted, explained: Explained) -> tuple[_Read, np.ndarray]:
+    """What it reads, and the range of each number."""
+    cells = one.cells
+    agents, things = np.nonzero(one.cause.holds(steps.x.shape[1]))
+    left = explained.left > 0.5
+    few = max(1, len(steps.x) * len(agents) * cells.cause.width // MOST_READ)
+    kept = (left if left.ndim == 1 else left.any(1)) | (np.arange(len(steps.x)) % few == 0)
+    scale = np.maximum(cells.high - cells.low, 1e-9)
+    values = np.asarray(one.cause.of(steps.x[kept])[:, agents, things] / scale, np.float32)
+    some = steps if kept.all() else steps.part(kept)
+    return _Read(some, values, agents, left[kept], ~some.unsafe), scale
+
+
+def _box(cells: Cells, scale: np.ndarray) -> list[_Side]:
+    """Sides around nearly all cells of danger, where others were visited beyond."""
+    visited = np.flatnonzero(cells.visits >= VISITED)
+    danger = visited[cells.danger[visited] > 0.5]
+    places, dangerous = (np.stack(np.unravel_index(at, (cells.bins,) * len(scale)), -1) for at in (visited, danger))
+    weight = (cells.visits * cells.danger)[danger]
+    sides = []
+    for k in range(len(scale)):
+        order = np.argsort(dangerous[:, k], kind="stable")
+        share = np.cumsum(weight[order]) / max(weight.sum(), 1e-9)
+        ends = (min(np.searchsorted(share, q), len(order) - 1) for q in (STRAY, 1 - STRAY))
+        first, last = (int(dangerous[order[end], k]) for end in ends)
+        begin, size = cells.low[k] / scale[k], 1.0 / cells.bins
+        if last < places[:, k].max():
+            sides.append(_Side(k, 1.0, begin + (last + 1) * size))
+        if first > places[:, k].min():
+            sides.append(_Side(k, -1.0, -(begin + first * size)))
+    return sides
+
+
+def _fitted(read: _Read, sides: list[_Side]) -> list[_Side]:
+    """The sides at thresholds that tell fewest steps wrongly, each in turn, without those that tell nothing."""
+    for _ in range(SWEEPS):
+        before = sides
+        for k, side in enumerate(sides):
+            score = np.where(_highest(read, sides, k) < 0, side.sign * read.values[..., side.number], np.inf)
+            tried, wrong = read.wrong(score)
+            if len(tried):
+                best = int(wrong.argmin())
+                at = 0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)])
+                sides = [*sides[:k], replace(side, at=float(at)), *sides[k + 1 :]]
+        if sides == before:
+            break
+    for side in list(sides):
+        rest = [other for other in sides if other is not side]
+        if rest and _count(read, rest) <= _count(read, sides) + NEEDLESS * read.bad.sum():
+            sides = rest
+    return sides
+
+
+def _highest(read: _Read, sides: Sequence[_Side], without: int = -1) -> np.ndarray:
+    """(T, P) the highest of all sides but one."""
+    found = np.full(read.values.shape[:-1], -np.inf, np.float32)
+    for k, side in enumerate(sides):
+        if k != without:
+            np.maximum(found, side.of(read.values), out=found)
+    return found
+
+
+def _count(read: _Read, sides: Sequence[_Side]) -> int:
+    """Steps that they tell wrongly."""
+    score = _highest(read, sides)
+    unsafe = of_the_worst(read.steps, score, score, read.agents) < 0
+    return int((read.bad & ~unsafe).sum() + (read.fine & unsafe).sum())
+
+
+def _condition(reads: Sequence[Quantity], side: _Side, scale: np.ndarray, units: np.ndarray) -> Sum:
+    """The side in units of the first number."""
+    weight = float(side.sign * units[side.number])
+    return Sum((reads[side.number],), (weight,), -float(side.at * scale[side.number] * units[side.number]))
+
+
+def _line(read: _Read, cells: Cells) -> tuple[tuple[float, float], float, float] | None:
+    """(signs, weight of the second number, where danger begins) of the line that tells fewest steps wrongly, towards
+    where danger is."""
+    centres, unsafe = cells.known()
+    if unsafe.all() or not unsafe.any():
+        return None
+    toward = centres[unsafe].mean(0) - centres[~unsafe].mean(0)
+    sign = (1.0 if toward[0] < 0 else -1.0), (1.0 if toward[1] < 0 else -1.0)
+    one, two = sign[0] * read.values[..., 0], sign[1] * read.values[..., 1]
+    weight, at = 1.0, 0.0
+    for factor, either in zip(RATIOS, TRIED):
+        tried = [weight * factor**k for k in range(-either, either + 1)]
+        found = [_best(read, one + np.float32(w) * two) for w in tried]
+        least = min(count for count, _ in found)
+        best = [k for k, (count, _) in enumerate(found) if count == least]
+        weight, at = tried[best[len(best) // 2]], found[best[len(best) // 2]][1]
+    return sign, weight, at
+
+
+def _best(read: _Read, score: np.ndarray) -> tuple[int, float]:
+    """(steps that it tells wrongly, where danger begins) of a score (T, P)."""
+    tried, wrong = read.wrong(score)
+    best = int(wrong.argmin())
+    return int(wrong[best]), float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
