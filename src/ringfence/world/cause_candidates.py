@@ -8,12 +8,13 @@ from collections.abc import Iterator, Sequence
 
 from ringfence.problem.entries import LANE, SPACE, Entries, axes_of
 from ringfence.world.causes import Cause
-from ringfence.world.quantities import Closing, Entry, Length, Over, Product, Quantity, Sum, Turned
+from ringfence.world.quantities import All, Closing, Entry, Length, Over, Product, Quantity, Sum, Turned, leaves
 
 WIDEST = 4  # numbers of one cause
 ROW = 3  # entries at least that names number
 NAMELESS = ("obs", "state", "entry")  # what numbers alone tell apart is no row
 FARTHEST = 6  # of several things, the so many-th nearest at most
+MOST_PAIRS = 45  # of things, that are read with oneself as three
 Fields = list[dict[str, int]]  # entries of each thing, by what they are
 
 
@@ -66,11 +67,41 @@ def pairs(names: Sequence[str]) -> Iterator[Cause]:
 
 
 def of_several(names: Sequence[str]) -> Iterator[Cause]:
-    """How far away the nearest of several things is, the second nearest, and so on: who is crowded, or alone."""
+    """How far away the nearest of several things is, the second nearest, and so on: who is crowded, or alone; how far
+    the middle of all is; and of oneself and two of them, how far apart all three are, and what area lies between."""
     for cause in offsets(names):
         count = cause.things
-        for k in range(1, min(count, FARTHEST) + 1 if count > 1 else 0):
+        offset = cause.reads[0].parts
+        if count < 2:
+            continue
+        for k in range(1, min(count, FARTHEST) + 1):
             yield Cause((Over(cause.reads[0], "things", k, count),))
+        yield Cause((Length(tuple(Over(part, "things", 0, count) for part in offset)),))
+        if count * (count - 1) // 2 <= MOST_PAIRS:
+            yield from _of_three(cause.vector or ())
+
+
+def _of_three(offset: tuple[Entry, ...]) -> Iterator[Cause]:
+    pairs = list(itertools.combinations(range(len(offset[0].at)), 2))
+    one, two = ([Entry(tuple(part.at[j[k]] for j in pairs), part.name) for part in offset] for k in range(2))
+    two = [Entry(part.at, f"another {part.name}") for part in two]
+    between = Length(tuple(Sum((a, b), (1.0, -1.0)) for a, b in zip(one, two)))
+    yield Cause((All((Length(tuple(one)), Length(tuple(two)), between)),))
+    if len(offset) == 2:
+        yield Cause((Length((Sum((Product((one[0], two[1])), Product((one[1], two[0]))), (0.5, -0.5)),)),))
+
+
+def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:
+    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are."""
+    own, several = _own(names), things_of(names)
+    known = set.union(*map(set, cause.entries()))
+    found = _numbers("", [own])
+    for kind, each in several.items():
+        if kind == cause.kind and len(each) == cause.things:
+            axes = axes_of(each[0])
+            found += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
+            found += _closing(kind, each, axes, own) if axes else ()
+    yield from (one for one in found if not known >= {d for leaf in leaves(one) for d in leaf.at})
 
 
 def of_team(names: Sequence[str]) -> Iterator[Cause]:
@@ -185,7 +216,13 @@ def _sets(of: str, each: Fields) -> Iterator[Cause]:
         yield Cause((one,))
     for both in itertools.combinations(entries, 2):
         yield Cause(both)
-        yield Cause((Length(both),))
+        if _stem(both[0].name) == _stem(both[1].name):
+            yield Cause((Length(both),))
+
+
+def _stem(name: str) -> str:
+    """What two numbers of one unit are called alike, but for their axis or their number: x and y, obs4 and obs5."""
+    return name[:-1] if name[-1] in SPACE + LANE else name.rstrip("0123456789_[].")
 
 
 def _numbers(of: str, each: Fields) -> list[Quantity]:

@@ -171,6 +171,10 @@ class Explained:
         safe = np.minimum.reduce([nothing, *[one.safe for one in chosen]])
         return cls(steps, safe, np.logical_or.reduce([nothing > 0, *[one.near for one in chosen]]))
 
+    def beside(self, one: Counted) -> Explained:
+        """What they tell with one more."""
+        return Explained(self.steps, np.minimum(self.safe, one.safe), self.near | one.near)
+
     def of(self, steps: Steps, some: np.ndarray) -> Explained:
         """What they tell of those that are some (T,) bool of the steps."""
         return Explained(steps, self.safe[some], self.near[some])

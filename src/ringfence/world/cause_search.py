@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.cause_candidates import candidates, of_several, of_team, pairs, wider
+from ringfence.world.cause_candidates import beside, candidates, of_several, of_team, pairs, wider
 from ringfence.world.cause_counts import (
     Counted,
     Explained,
@@ -32,8 +32,8 @@ from ringfence.world.cause_counts import (
 )
 from ringfence.world.causes import Cause, Edge, Found, narrowed, only_of, only_where
 from ringfence.world.cells import CELLS, Cells
-from ringfence.world.quantities import Entry, Length, Over
-from ringfence.world.rules import rules_of
+from ringfence.world.quantities import Entry, Length, Over, Quantity
+from ringfence.world.rules import rules_of, tilted_of
 
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
@@ -45,6 +45,7 @@ ENOUGH = 0.98  # share of unsafe steps, and of safe ones, that causes tell, from
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
 ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too
+MOST_TERMS = 3  # that a threshold depends on
 EPISODES = 2  # in which they have to be: one alone may be an accident
 
 
@@ -83,28 +84,55 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
 def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str], team: bool) -> list[Counted]:
     """The causes, or those that are found with more that may be read, where these tell more. Aircraft are too near
     where they are near across and in height, vehicles where they are along and aside, or near and fast; what is ahead
-    is in danger, or what would meet soon; or who is fast in some place."""
+    is in danger, or what would meet soon; or who is fast in some place; and loads are the team's."""
     if _tell_enough(steps, chosen):
         return chosen
     several = [one for one in _about_whom(steps, of_several(names)) if _is_of_several(steps, one)]
     shapes = [*_about_whom(steps, pairs(names)), *several, *(_about_whom(steps, of_team(names)) if team else ())]
     found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
-    if not {one.cause for one in found} & set(shapes):
-        return chosen
-    for k, one in enumerate(found):
-        found[k] = _as_rule(steps, one, shapes, _without(steps, found, one)) if one.cause.width > 1 else one
-    found = _pruned(steps, found)
+    chosen, found = (_as_rules(steps, each, shapes, names) for each in (chosen, found))
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
     return found if more - less > SURE * error else chosen
+
+
+def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names: Sequence[str]) -> list[Counted]:
+    """The causes, those of several numbers as rules where these tell as much."""
+    for k, one in enumerate(chosen):
+        explained = _without(steps, chosen, one)
+        best = _as_rule(steps, one, pool, explained) if one.cause.width > 1 else counted(steps, one.cause, explained)
+        chosen = [*chosen[:k], _tilted(steps, best, names, explained), *chosen[k + 1 :]]
+    return _pruned(steps, chosen)
+
+
+def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained) -> Counted:
+    """The cause with thresholds that depend on other numbers, where these tell clearly more: boxes as long as both are,
+    limits that fall along a way."""
+    for _ in range(MOST_TERMS):
+        more = [one for one in beside(best.cause, names) if _varies(steps, one)]
+        tilted = tilted_of(steps, best, explained, more)
+        if tilted is None:
+            return best
+        found = counted(steps, tilted, explained)
+        more, error = gain(steps, explained.beside(best), found.safe)
+        less = gain(steps, explained.beside(found), best.safe)[0]
+        if found.gain < (1 + SIMPLER) * best.gain or more - less < SURE * error:
+            return best
+        best = found
+    return best
+
+
+def _varies(steps: Steps, quantity: Quantity) -> bool:
+    return bool(Cause((quantity,)).varies(steps.varies).any())
 
 
 def _is_of_several(steps: Steps, cause: Cause) -> bool:
     """Whether the distance of the k-th nearest tells what that of each does not: that of the nearest does so where it
     is dangerous to be far from all, and that of the farthest where it is to be near all."""
     (read,) = cause.reads
-    assert isinstance(read, Over)
+    if not isinstance(read, Over):
+        return True
     below = counted(steps, cause, Explained.by(steps, [])).cells.edge.below
     return read.rank > 1 if below else read.rank < read.count
 

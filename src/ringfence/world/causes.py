@@ -12,7 +12,6 @@ import numpy as np
 from msgspec.structs import replace
 
 from ringfence.world.quantities import (
-    All,
     Between,
     Entry,
     Length,
@@ -20,6 +19,7 @@ from ringfence.world.quantities import (
     from_zero,
     goes_on,
     how_many,
+    is_condition,
     leaves,
     varies,
 )
@@ -76,7 +76,7 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_rule(self) -> bool:
         """Whether it is conditions that hold together, and dangerous below 0."""
-        return isinstance(self.reads[0], All) or bool(getattr(self.reads[0], "more", 0.0))
+        return self.width == 1 and is_condition(self.reads[0])
 
     @property
     def vector(self) -> tuple[Entry, ...] | None:

@@ -115,23 +115,25 @@ class Turned(msgspec.Struct, frozen=True, tag=True):
 
 
 class Sum(msgspec.Struct, frozen=True, tag=True):
-    """A weighted sum, and a number."""
+    """A weighted sum; with a number more it is a condition, which holds below 0."""
 
     parts: tuple[Quantity, ...]
     weights: tuple[float, ...]
-    more: float = 0.0
+    more: float | None = None
 
     def of(self, x: Any) -> Any:
-        return _plus(_total([_scaled(part.of(x), w) for part, w in zip(self.parts, self.weights)]), self.more)
+        found = _total([_scaled(part.of(x), w) for part, w in zip(self.parts, self.weights)])
+        return found if self.more is None else _plus(found, self.more)
 
     @property
     def words(self) -> str:
-        """As a condition, where it is one number and another: which of both is below or above."""
-        if len(self.parts) == 1 and self.more:
-            side = "below" if self.weights[0] > 0 else "above"
-            return f"{self.parts[0].words} {side} {-self.more / self.weights[0]:.3g}"
-        said = "".join(_term(part.words, w, k) for k, (part, w) in enumerate(zip(self.parts, self.weights)))
-        return f"{said} below {-self.more:.3g}" if self.more else said
+        """In units of the first part; a condition says what is below or above something."""
+        unit = self.weights[0] if self.more is not None else 1.0
+        terms = zip(self.parts, self.weights)
+        said = "".join(_term(part.words, w / unit, k) for k, (part, w) in enumerate(terms))
+        if self.more is None:
+            return said
+        return f"{said} {'below' if unit > 0 else 'above'} {-self.more / unit:.3g}"
 
 
 class Product(msgspec.Struct, frozen=True, tag=True):
@@ -148,7 +150,7 @@ class Product(msgspec.Struct, frozen=True, tag=True):
 
 
 class All(msgspec.Struct, frozen=True, tag=True):
-    """The highest of conditions, each of which holds below 0: it is below 0 where all hold."""
+    """The highest of several numbers: of conditions it is below 0 where all hold."""
 
     parts: tuple[Quantity, ...]
 
@@ -157,7 +159,8 @@ class All(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def words(self) -> str:
-        return " and ".join(part.words for part in self.parts)
+        each = [part.words for part in self.parts]
+        return " and ".join(each) if is_condition(self) else f"the highest of {', '.join(each)}"
 
 
 class Over(msgspec.Struct, frozen=True, tag=True):
@@ -227,6 +230,13 @@ def from_zero(quantity: Quantity) -> bool:
     return isinstance(quantity, Length) or (isinstance(quantity, Turned) and quantity.what == "angle")
 
 
+def is_condition(quantity: Quantity) -> bool:
+    """Whether it is below 0 where something holds, one condition or several."""
+    if isinstance(quantity, All):
+        return all(is_condition(part) for part in quantity.parts)
+    return isinstance(quantity, Sum) and quantity.more is not None
+
+
 def goes_on(quantity: Quantity) -> bool:
     """Whether what is beyond all that was seen is like the nearest that was: nearer is worse. Of an entry it is not."""
     if isinstance(quantity, Over):
@@ -241,10 +251,9 @@ def below(quantity: Quantity, x: Between) -> tuple[Any, Any]:
 
 
 def _term(words: str, weight: float, k: int) -> str:
-    size = "" if abs(abs(weight) - 1.0) < 1e-9 else f"{abs(weight):.3g} times "
-    if k == 0:
-        return f"{'less ' if weight < 0 else ''}{size}{words}"
-    return f" {'less' if weight < 0 else 'and'} {size}{words}"
+    size = "" if abs(abs(weight) - 1.0) < 1e-6 else f"{abs(weight):.3g} times "
+    sign = "less " if weight < 0 else "and " if k else ""
+    return f"{' ' if k else ''}{sign}{size}{words}"
 
 
 # --- arithmetic of arrays and of what is between two of them ---

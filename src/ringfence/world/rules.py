@@ -20,6 +20,7 @@ STRAY = 0.02  # share of the danger that may lie outside of the box that a rule 
 NEEDLESS = 0.002  # share of the unsafe steps by which a condition has to make fewer wrong
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tried to be more or less, ever finer
 TRIED = (10, 3, 3, 3)  # such factors to either side
+TILTS = tuple(0.01 * 2.0**k for k in range(8))  # of the deviation of what shifts a threshold
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,98 @@ def rules_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause
 
 def replace_reads(cause: Cause, read: Quantity) -> Cause:
     return Cause((read,), cause.who)
+
+
+def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Quantity]) -> Cause | None:
+    """The cause with one of its thresholds a line of one number more: the one that tells fewest steps wrongly."""
+    conditions = _conditions(one)
+    if not conditions or not more:
+        return None
+    read, _ = _read(steps, one, explained)
+    x = read.steps.x
+    agents, things = np.nonzero(one.cause.holds(x.shape[1]))
+    picked = [_of_picked(condition, x, agents, things) for condition in conditions]
+    numbers = [_of_picked(quantity, x, agents, things) for quantity in more]
+    best: tuple[int, float, float, int, int] | None = None  # wrong, weight, at, condition, number
+    for k, values in enumerate(picked):
+        others = [other for j, other in enumerate(picked) if j != k]
+        near = np.logical_and.reduce([np.ones(values.shape, bool), *(other < 0 for other in others)])
+        some = _Few.of(read, near)
+        for j, number in enumerate(numbers):
+            spread = float(number[near].std()) if near.any() else 0.0
+            if spread <= 0:
+                continue
+            unit = float(values[near].std()) / spread
+            for weight in (sign * unit * size for sign in (1.0, -1.0) for size in TILTS):
+                wrong, at = some.best(values[near] + np.float32(weight) * number[near])
+                if best is None or wrong < best[0]:
+                    best = wrong, weight, at, k, j
+    if best is None:
+        return None
+    _, weight, _, k, j = best
+    others = [other for i, other in enumerate(picked) if i != k]
+    near = np.logical_and.reduce([np.ones(picked[k].shape, bool), *(other < 0 for other in others)])
+    some, at = _Few.of(read, near), best[2]
+    for factor in RATIOS[1:]:
+        tried = [weight * factor**i for i in range(-3, 4)]
+        found = [some.best(picked[k][near] + np.float32(w) * numbers[j][near]) for w in tried]
+        least = min(wrong for wrong, _ in found)
+        alike = [i for i, (wrong, _) in enumerate(found) if wrong == least]
+        weight, at = tried[alike[len(alike) // 2]], found[alike[len(alike) // 2]][1]
+    old = conditions[k]
+    new = Sum((*old.parts, more[j]), (*old.weights, float(weight)), float((old.more or 0.0) - at))
+    parts = (*conditions[:k], new, *conditions[k + 1 :])
+    return replace_reads(one.cause, parts[0] if len(parts) == 1 else All(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class _Few:
+    """The agents and things of steps for which all other conditions hold."""
+
+    starts: np.ndarray  # where those of another step, or of another agent in it, begin
+    bad: np.ndarray  # bool, of each of these
+    fine: np.ndarray
+    missed: int  # unsafe steps that hold none
+
+    @classmethod
+    def of(cls, read: _Read, near: np.ndarray) -> _Few:
+        step, number = np.nonzero(near)
+        whose = step if read.bad.ndim == 1 else step * read.bad.shape[1] + read.agents[number]
+        keys, starts = np.unique(whose, return_index=True)
+        bad, fine = read.bad.reshape(-1)[keys], read.fine.reshape(-1)[keys]
+        return cls(starts, bad, fine, int(read.bad.sum() - bad.sum()))
+
+    def best(self, score: np.ndarray) -> tuple[int, float]:
+        """(steps that a score tells wrongly, where danger begins), low in danger."""
+        if not len(self.starts):
+            return self.missed, 0.0
+        worst = np.minimum.reduceat(score, self.starts)
+        tried, wrong = told_wrong(np.sort(worst[self.bad]), np.sort(worst[self.fine]))
+        if not len(tried):
+            return self.missed, 0.0
+        best = int(wrong.argmin())
+        return int(wrong[best]) + self.missed, float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
+
+
+def _conditions(one: Counted) -> tuple[Sum, ...]:
+    """Of a rule, or of a cause of one number with one edge."""
+    if one.cause.width > 1:
+        return ()
+    read, edge = one.cause.reads[0], one.cells.edge
+    if one.cause.is_rule:
+        return tuple(part for part in (read.parts if isinstance(read, All) else (read,)) if isinstance(part, Sum))
+    if len(edge.bounds) - sum(edge.unseen) != 1:
+        return ()
+    (at,) = (bound for bound, unseen in zip(edge.bounds, edge.unseen) if not unseen)
+    below = edge.inside == (sum(bound < at for bound in edge.bounds) % 2 == 0)
+    sign = 1.0 if below else -1.0
+    return (Sum((read,), (sign,), -sign * at),)
+
+
+def _of_picked(quantity: Quantity, x: np.ndarray, agents: np.ndarray, things: np.ndarray) -> np.ndarray:
+    """(T, P) of these agents and things."""
+    found = quantity.of(x)
+    return np.asarray(found[:, agents, things if found.shape[-1] > 1 else 0], np.float32)
 
 
 def _read(steps: Steps, one: Counted, explained: Explained) -> tuple[_Read, np.ndarray]:
