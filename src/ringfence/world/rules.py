@@ -185,6 +185,8 @@ def _box(cells: Cells, scale: np.ndarray) -> list[_Side]:
     """Sides around nearly all cells of danger, where others were visited beyond."""
     visited = np.flatnonzero(cells.visits >= VISITED)
     danger = visited[cells.danger[visited] > 0.5]
+    if not len(danger):
+        return []
     places, dangerous = (np.stack(np.unravel_index(at, (cells.bins,) * len(scale)), -1) for at in (visited, danger))
     weight = (cells.visits * cells.danger)[danger]
     sides = []
