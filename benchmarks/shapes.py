@@ -2,9 +2,11 @@
 
     python benchmarks/shapes.py                    # of all; ten minutes a system
     python benchmarks/shapes.py docks --seed 11    # of some, by other logs
+    python benchmarks/shapes.py --families open    # of systems that the search had not seen (families.py)
 
-Systems whose danger is no distance alone go to results/shapes.csv, those that log places to results/on_map.csv, and
-the one that logs a list of who is near to results/proving/trackers.json. Rows that are there are not made again.
+Systems whose danger is no distance alone go to results/shapes.csv, those that log places to results/on_map.csv, the
+one that logs a list of who is near to results/proving/trackers.json, and families, of 60 episodes a row, to
+results/families.csv. Rows that are there are not made again.
 Files also hold rows of Worlds that lack what their column `causes` says; they were made by revision cac628af, which
 patched the library for them.
 """
@@ -16,6 +18,7 @@ import warnings
 from typing import Any
 
 from common import RESULTS, append, brief, keep, of_json, read
+from families import FAMILIES
 from systems import MAPPED, SHAPED, TRACKED, Kind
 
 import ringfence
@@ -25,6 +28,7 @@ LOGGED, EPISODES = 600, 100
 HEAD = ("system", "seed", "driver", "causes", "verdict", "found", "guard")
 HEAD += ("episodes", "return", "violated", "bound", "infeasible_rate")
 GROUPS = (("shapes.csv", SHAPED, "more shapes", 10), ("on_map.csv", MAPPED, "how far away", 13))
+OF_FAMILY = (*HEAD, "family", "kept")
 WAYS = [(driver, guard) for driver in ("naive", "clone") for guard in ("none", "shield")]
 
 
@@ -32,8 +36,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("systems", nargs="*", help="all by default")
     parser.add_argument("--seed", type=int, help="of the logs")
+    parser.add_argument("--families", choices=("open", "kept"), help="systems that anybody may look at, or the others")
+    parser.add_argument("--causes", default="as it is", help="what to call this version in rows of families")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
+    if given.families:
+        for family in FAMILIES:
+            for kind in getattr(family, given.families):
+                if kind.name in (given.systems or [kind.name]):
+                    of = {"family": family.name, "kept": int(given.families == "kept")}
+                    seed = 12 if given.seed is None else given.seed
+                    rows_of(kind, "families.csv", given.causes, seed, 60, of)
+        return
     for file, kinds, whole, seed in GROUPS:
         for kind in kinds:
             if kind.name in (given.systems or [kind.name]):
@@ -43,17 +57,19 @@ def main() -> None:
         keep(RESULTS / "proving" / "trackers.json", {"as it is": tracked()} | found)
 
 
-def played(kind: Kind, world: Any, clone: Any, driver: str, guard: str) -> dict[str, Any]:
+def played(kind: Kind, world: Any, clone: Any, driver: str, guard: str, episodes: int = EPISODES) -> dict[str, Any]:
     """Who drives, alone (the guard looks on) or guarded."""
     if driver == "naive":
         act, how = ringfence.guard(kind.naive, world, guard=guard, anyway=True), {}
     else:
         act, how = clone, {} if guard == "none" else {"guard": guard, "world": world, "anyway": True}
-    return ringfence.play(act, kind.env, episodes=EPISODES, num_envs=100, **how)
+    return ringfence.play(act, kind.env, episodes=episodes, num_envs=episodes, **how)
 
 
-def rows_of(kind: Kind, file: str, whole: str, seed: int) -> None:
-    """The rows of a system, by logs of this seed, that are not there."""
+def rows_of(
+    kind: Kind, file: str, whole: str, seed: int, episodes: int = EPISODES, of: dict[str, Any] | None = None
+) -> None:
+    """The rows of a system, by logs of this seed, that are not there; `of` says what family it is of."""
     rows = [r for r in read(file) if (r["system"], r["seed"], r["causes"]) == (kind.name, str(seed), whole)]
     wanted = [way for way in WAYS if way not in {(r["driver"], r["guard"]) for r in rows}]
     if not wanted:
@@ -63,11 +79,11 @@ def rows_of(kind: Kind, file: str, whole: str, seed: int) -> None:
     world = ringfence.fit(store)
     found = "; ".join(c.name for c in world.card.causes[""].causes) or "networks on all entries"
     for driver, guard in wanted:
-        r = played(kind, world, clone, driver, guard)
-        bound = upper_bound(round(r["violation_rate"] * EPISODES), EPISODES)
-        row = [kind.name, seed, driver, whole, world.card.verdict.word, found, guard, EPISODES]
+        r = played(kind, world, clone, driver, guard, episodes)
+        bound = upper_bound(round(r["violation_rate"] * episodes), episodes)
+        row = [kind.name, seed, driver, whole, world.card.verdict.word, found, guard, episodes]
         row += [r["return_mean"], r["violation_rate"], bound, r.get("infeasible_rate", 0.0)]
-        append(RESULTS / file, brief(dict(zip(HEAD, row))), HEAD)
+        append(RESULTS / file, brief(dict(zip(HEAD, row)) | (of or {})), OF_FAMILY if of else HEAD)
 
 
 def tracked() -> dict[str, Any]:

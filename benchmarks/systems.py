@@ -154,7 +154,7 @@ class Kind:
 
     name: str
     says: str  # what is dangerous
-    danger: Callable[[Moment], Any]
+    danger: Callable[[Moment], Any]  # whether the team is in danger, or what each agent (N,) pays
     drives: Driver  # past nobody
     takes_care: Careful
     names: Sequence[str]  # of the numbers that each sees
@@ -195,7 +195,7 @@ class Kind:
 
 class Moment(ParallelEnv):
     """A system as it is now: places `p`, velocities `v`, goals (N, A), and what else there is. Agents share a reward,
-    and a cost where any of them is in danger."""
+    and a cost where any of them is in danger, unless danger is of each."""
 
     p: Array
     v: Array
@@ -229,7 +229,7 @@ class Moment(ParallelEnv):
         self.rng = np.random.default_rng(seed)
         self.agents, self.t = list(self.possible_agents), 0
         self.kind.begin(self)
-        while self.kind.danger(self):
+        while np.any(self.kind.danger(self)):
             self.kind.begin(self)
         return self._by_agent(self.rows().astype(np.float32)), {a: {} for a in self.agents}
 
@@ -238,15 +238,17 @@ class Moment(ParallelEnv):
         agents, over = self.agents, self.t >= self.kind.steps
         self.agents = [] if over else agents
         same = self._by_agent(np.broadcast_to(reward, self.kind.n).tolist())
-        infos = {a: {"cost": cost} for a in agents}
+        costs = self._by_agent(np.broadcast_to(cost, self.kind.n).tolist())
+        infos = {a: {"cost": costs[a]} for a in agents}
         seen = self._by_agent(self.rows().astype(np.float32))
         return seen, same, dict.fromkeys(agents, False), dict.fromkeys(agents, over), infos
 
-    def moved(self, actions: Array) -> tuple[Any, float]:
-        """Reward and cost of actions (N, A)."""
+    def moved(self, actions: Array) -> tuple[Any, Any]:
+        """Reward and cost of actions (N, A): the team's, or (N,) of each."""
         reward = self.kind.move(self, np.clip(actions, -1, 1))
         self.t += 1
-        return reward, float(bool(self.kind.danger(self)))
+        danger = self.kind.danger(self)
+        return reward, np.asarray(danger, float) if np.ndim(danger) else float(bool(danger))
 
     def rows(self) -> Array:
         """(N, O) what each sees."""
