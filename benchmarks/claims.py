@@ -750,7 +750,7 @@ def plans_cross() -> tuple[bool, str]:
 def plans_run() -> tuple[bool, str]:
     """On robots under `adapt`: what plans earn more than clones, of the same seeds on the same resets, and whether both
     keep the limit."""
-    apart, runs, kept = {}, [], True
+    apart, runs, seeds, kept = {}, [], [], True
     for task in [t for t in planner_tables.paper.PRINTED if not t.startswith("simple")]:
         rows = planner_tables.rows_of("robots", task)
         ways = (("icbf", "cool, under adapt"), ("bc", "under adapt"))
@@ -758,13 +758,15 @@ def plans_run() -> tuple[bool, str]:
         more = np.subtract(*planner_tables.paired(*both))
         apart[task] = more.mean()
         runs += [mean_of_runs(each[None]) for each in more]
+        seeds.append(mean_of_runs(more))
         cost = max(np.mean([r["cost"] for r in some]) for some in both)
         kept = kept and cost <= TASKS[task].cost_limit
     more, less = sum(low > 0 for low, _ in runs), sum(high < 0 for _, high in runs)
     words = ", ".join(f"{task} {mean:+.0f}" for task, mean in apart.items())
     holds = (
-        sum(mean > 0 for mean in apart.values()) == 8 and len(apart) == 9 and more > len(runs) / 2 and not less and kept
+        sum(mean > 0 for mean in apart.values()) == 8 and (len(apart), len(runs), more, less) == (9, 27, 15, 2) and kept
     )
+    holds = holds and sum(low > 0 for low, _ in seeds) == 2 and not any(high < 0 for _, high in seeds)
     return bool(holds), f"{words}; of {len(runs)} runs {more} more, {less} less"
 
 
