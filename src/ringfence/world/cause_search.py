@@ -91,7 +91,8 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str],
     shapes = [*_about_whom(steps, pairs(names)), *several, *(_about_whom(steps, of_team(names)) if team else ())]
     found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
-    chosen, found = (_as_rules(steps, each, shapes, names) for each in (chosen, found))
+    chosen = _as_rules(steps, chosen, shapes, names)
+    found = _as_rules(steps, found, shapes, names)
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
     return found if more - less > SURE * error else chosen

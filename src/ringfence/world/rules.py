@@ -16,6 +16,7 @@ from ringfence.world.quantities import All, Quantity, Sum
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
+SCREENED = 400_000  # likewise, at first
 STRAY = 0.02  # share of the danger that may lie outside of the box that a rule begins with
 NEEDLESS = 0.002  # share of the unsafe steps by which a condition has to make fewer wrong
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tried to be more or less, ever finer
@@ -81,37 +82,26 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     conditions = _conditions(one)
     if not conditions or not more:
         return None
-    read, _ = _read(steps, one, explained)
-    x = read.steps.x
-    agents, things = np.nonzero(one.cause.holds(x.shape[1]))
-    picked = [_of_picked(condition, x, agents, things) for condition in conditions]
-    numbers = [_of_picked(quantity, x, agents, things) for quantity in more]
-    best: tuple[int, float, float, int, int] | None = None  # wrong, weight, at, condition, number
-    for k, values in enumerate(picked):
-        others = [other for j, other in enumerate(picked) if j != k]
-        near = np.logical_and.reduce([np.ones(values.shape, bool), *(other < 0 for other in others)])
-        some = _Few.of(read, near)
-        for j, number in enumerate(numbers):
-            spread = float(number[near].std()) if near.any() else 0.0
-            if spread <= 0:
-                continue
-            unit = float(values[near].std()) / spread
-            for weight in (sign * unit * size for sign in (1.0, -1.0) for size in TILTS):
-                wrong, at = some.best(values[near] + np.float32(weight) * number[near])
-                if best is None or wrong < best[0]:
-                    best = wrong, weight, at, k, j
-    if best is None:
+    read = _read(steps, one, explained, SCREENED)[0]
+    tried = []
+    for k in range(len(conditions)):
+        near = _Near.of(read, one.cause, conditions, k)
+        for j, number in enumerate(more):
+            numbers = near.of_quantity(number)
+            if len(numbers) and numbers.std() > 0:
+                unit = float(near.values.std() / numbers.std())
+                weights = [sign * unit * size for sign in (1.0, -1.0) for size in TILTS]
+                tried += [(near.best(numbers, weight)[0], k, j, weight) for weight in weights]
+    if not tried:
         return None
-    _, weight, _, k, j = best
-    others = [other for i, other in enumerate(picked) if i != k]
-    near = np.logical_and.reduce([np.ones(picked[k].shape, bool), *(other < 0 for other in others)])
-    some, at = _Few.of(read, near), best[2]
+    _, k, j, weight = min(tried)
+    near = _Near.of(_read(steps, one, explained)[0], one.cause, conditions, k)
+    numbers, at = near.of_quantity(more[j]), 0.0
     for factor in RATIOS[1:]:
-        tried = [weight * factor**i for i in range(-3, 4)]
-        found = [some.best(picked[k][near] + np.float32(w) * numbers[j][near]) for w in tried]
-        least = min(wrong for wrong, _ in found)
-        alike = [i for i, (wrong, _) in enumerate(found) if wrong == least]
-        weight, at = tried[alike[len(alike) // 2]], found[alike[len(alike) // 2]][1]
+        weights = [weight * factor**i for i in range(-3, 4)]
+        found = [near.best(numbers, each) for each in weights]
+        alike = [i for i, (wrong, _) in enumerate(found) if wrong == min(found)[0]]
+        weight, at = weights[alike[len(alike) // 2]], found[alike[len(alike) // 2]][1]
     old = conditions[k]
     new = Sum((*old.parts, more[j]), (*old.weights, float(weight)), float((old.more or 0.0) - at))
     parts = (*conditions[:k], new, *conditions[k + 1 :])
@@ -119,32 +109,38 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
 
 
 @dataclass(frozen=True, eq=False)
-class _Few:
-    """The agents and things of steps for which all other conditions hold."""
+class _Near:
+    """The agents and things of steps for which all conditions but one hold, one after the other."""
 
+    read: _Read
+    at: tuple[np.ndarray, np.ndarray]  # step and which of the agents and things
+    things: np.ndarray  # (P,) of which agents' things
+    values: np.ndarray  # of the one condition
     starts: np.ndarray  # where those of another step, or of another agent in it, begin
     bad: np.ndarray  # bool, of each of these
     fine: np.ndarray
-    missed: int  # unsafe steps that hold none
 
     @classmethod
-    def of(cls, read: _Read, near: np.ndarray) -> _Few:
-        step, number = np.nonzero(near)
-        whose = step if read.bad.ndim == 1 else step * read.bad.shape[1] + read.agents[number]
+    def of(cls, read: _Read, cause: Cause, conditions: Sequence[Sum], k: int) -> _Near:
+        things = np.nonzero(cause.holds(read.steps.x.shape[1]))[1]
+        each = [_of_picked(one, read.steps.x, read.agents, things) for one in conditions]
+        others = [other < 0 for i, other in enumerate(each) if i != k]
+        at = np.nonzero(np.logical_and.reduce([np.ones(each[k].shape, bool), *others]))
+        whose = at[0] if read.bad.ndim == 1 else at[0] * read.bad.shape[1] + read.agents[at[1]]
         keys, starts = np.unique(whose, return_index=True)
         bad, fine = read.bad.reshape(-1)[keys], read.fine.reshape(-1)[keys]
-        return cls(starts, bad, fine, int(read.bad.sum() - bad.sum()))
+        return cls(read, at, things, each[k][at], starts, bad, fine)
 
-    def best(self, score: np.ndarray) -> tuple[int, float]:
-        """(steps that a score tells wrongly, where danger begins), low in danger."""
-        if not len(self.starts):
-            return self.missed, 0.0
-        worst = np.minimum.reduceat(score, self.starts)
+    def of_quantity(self, quantity: Quantity) -> np.ndarray:
+        return _of_picked(quantity, self.read.steps.x, self.read.agents, self.things)[self.at]
+
+    def best(self, numbers: np.ndarray, weight: float) -> tuple[int, float]:
+        """(steps that the condition tells wrongly with so much of these numbers, where danger begins)."""
+        worst = np.minimum.reduceat(self.values + np.float32(weight) * numbers, self.starts)
         tried, wrong = told_wrong(np.sort(worst[self.bad]), np.sort(worst[self.fine]))
-        if not len(tried):
-            return self.missed, 0.0
         best = int(wrong.argmin())
-        return int(wrong[best]) + self.missed, float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
+        missed = int(self.read.bad.sum() - self.bad.sum())
+        return int(wrong[best]) + missed, float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
 
 
 def _conditions(one: Counted) -> tuple[Sum, ...]:
@@ -168,17 +164,26 @@ def _of_picked(quantity: Quantity, x: np.ndarray, agents: np.ndarray, things: np
     return np.asarray(found[:, agents, things if found.shape[-1] > 1 else 0], np.float32)
 
 
-def _read(steps: Steps, one: Counted, explained: Explained) -> tuple[_Read, np.ndarray]:
-    """What it reads, and the range of each number."""
+def _read(steps: Steps, one: Counted, explained: Explained, most: int = MOST_READ) -> tuple[_Read, np.ndarray]:
+    """What it reads in as many steps as are so many numbers, and the range of each number."""
     cells = one.cells
     agents, things = np.nonzero(one.cause.holds(steps.x.shape[1]))
     left = explained.left > 0.5
-    few = max(1, len(steps.x) * len(agents) * cells.cause.width // MOST_READ)
-    kept = (left if left.ndim == 1 else left.any(1)) | (np.arange(len(steps.x)) % few == 0)
+    kept = left if left.ndim == 1 else left.any(1)
+    room = max(1, most // (len(agents) * cells.cause.width))
+    kept = _thinned(kept, room // 2) | _thinned(~kept, room - min(kept.sum(), room // 2))
     scale = np.maximum(cells.high - cells.low, 1e-9)
     values = np.asarray(one.cause.of(steps.x[kept])[:, agents, things] / scale, np.float32)
     some = steps if kept.all() else steps.part(kept)
     return _Read(some, values, agents, left[kept], ~some.unsafe), scale
+
+
+def _thinned(some: np.ndarray, count: int) -> np.ndarray:
+    """(T,) bool: every so many-th of them, about as many as that at most."""
+    at = np.flatnonzero(some)
+    found = np.zeros(some.shape, bool)
+    found[at[:: max(1, -(-len(at) // max(count, 1)))]] = True
+    return found
 
 
 def _box(cells: Cells, scale: np.ndarray) -> list[_Side]:
