@@ -33,7 +33,7 @@ from ringfence.world.cause_counts import (
 from ringfence.world.causes import Cause, Edge, Found, narrowed, only_of, only_where
 from ringfence.world.cells import CELLS, Cells
 from ringfence.world.quantities import Entry, Length, Over, Quantity
-from ringfence.world.rules import rules_of, tilted_of
+from ringfence.world.rules import rules_of, tilted_of, weighted_of
 
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
@@ -108,19 +108,18 @@ def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names:
 
 
 def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained) -> Counted:
-    """The cause with thresholds that depend on other numbers, where these tell clearly more: boxes as long as both are,
-    limits that fall along a way."""
+    """The cause with thresholds that depend on other numbers, or a sum over the team with weights, where these tell
+    clearly more: boxes as long as both are, limits that fall along a way."""
     for _ in range(MOST_TERMS):
         more = [one for one in beside(best.cause, names) if _varies(steps, one)]
-        tilted = tilted_of(steps, best, explained, more)
-        if tilted is None:
+        tried = weighted_of(steps, best, explained), tilted_of(steps, best, explained, more)
+        found = [counted(steps, cause, explained) for cause in tried if cause is not None]
+        better = max(found, key=lambda one: one.gain, default=best)
+        more, error = gain(steps, explained.beside(best), better.safe)
+        less = gain(steps, explained.beside(better), best.safe)[0]
+        if better.gain < (1 + SIMPLER) * best.gain or more - less < SURE * error:
             return best
-        found = counted(steps, tilted, explained)
-        more, error = gain(steps, explained.beside(best), found.safe)
-        less = gain(steps, explained.beside(found), best.safe)[0]
-        if found.gain < (1 + SIMPLER) * best.gain or more - less < SURE * error:
-            return best
-        best = found
+        best = better
     return best
 
 

@@ -170,10 +170,13 @@ class Over(msgspec.Struct, frozen=True, tag=True):
     axis: Literal["things", "team"]
     rank: int = 0  # from 1 on; 0: the sum
     count: int = 0  # of the things; of a team it is as large as it is
+    weights: tuple[float, ...] = ()  # of agents in a sum over the team; none: alike
 
     def of(self, x: Any) -> Any:
         """(..., N, 1) of features (..., N, D)."""
         each = self.part.of(x)
+        if self.weights:
+            each = _times(each, _constant(each, np.array(self.weights, np.float32)[:, None]))
         if self.axis == "things":
             return _summed(each, -1) if not self.rank else _ranked(each, -1, self.rank)
         return _alike(_summed(each, (-2, -1)) if not self.rank else _ranked(each, -2, self.rank), each)
@@ -185,6 +188,8 @@ class Over(msgspec.Struct, frozen=True, tag=True):
     @property
     def words(self) -> str:
         whose = "over the team" if self.axis == "team" else "over all"
+        if self.weights:
+            return f"sum of {self.part.words} times {', '.join(f'{w:.3g}' for w in self.weights)} {whose}"
         if not self.rank:
             return f"sum of {self.part.words} {whose}"
         if self.axis == "things" and self.part.words.endswith(".distance"):
@@ -296,6 +301,10 @@ def _times(a: Any, b: Any) -> Any:
         return a * b
     corners = [one * two for one in a for two in b]
     return Between(_least(corners), _highest(corners))
+
+
+def _constant(a: Any, number: Any) -> Any:
+    return Between(number, number) if isinstance(a, Between) else number
 
 
 def _over(a: Any, length: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, told_wrong
 from ringfence.world.causes import Cause
 from ringfence.world.cells import VISITED, Cells
-from ringfence.world.quantities import All, Quantity, Sum
+from ringfence.world.quantities import All, Over, Quantity, Sum
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
@@ -21,6 +21,7 @@ STRAY = 0.02  # share of the danger that may lie outside of the box that a rule 
 NEEDLESS = 0.002  # share of the unsafe steps by which a condition has to make fewer wrong
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tried to be more or less, ever finer
 TRIED = (10, 3, 3, 3)  # such factors to either side
+WEIGHTS = (0.5, 0.7, 1.4, 2.0)  # times which an agent's weight in a sum is tried
 TILTS = tuple(0.01 * 2.0**k for k in range(8))  # of the deviation of what shifts a threshold
 
 
@@ -106,6 +107,35 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     new = Sum((*old.parts, more[j]), (*old.weights, float(weight)), float((old.more or 0.0) - at))
     parts = (*conditions[:k], new, *conditions[k + 1 :])
     return replace_reads(one.cause, parts[0] if len(parts) == 1 else All(parts))
+
+
+def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Cause | None:
+    """A cause of a sum over the team with weights of agents by which fewest steps are told wrongly, each in turn."""
+    (read,) = one.cause.reads[:1]
+    agents = steps.x.shape[1]
+    if one.cause.width > 1 or not isinstance(read, Over) or read.axis != "team" or read.rank or agents < 2:
+        return None
+    told = _read(steps, one, explained)[0]
+    team = told.bad if told.bad.ndim == 1 else told.bad.any(1)
+    fine = told.fine if told.fine.ndim == 1 else told.fine.all(1)
+    each = np.asarray(read.part.of(told.steps.x).sum(-1), np.float64)  # (T, N)
+    sign = 1.0 if one.cells.edge.below else -1.0
+
+    def wrong(weights: np.ndarray) -> int:
+        score = sign * each @ weights
+        return int(told_wrong(np.sort(score[team]), np.sort(score[fine]))[1].min())
+
+    weights, least = np.ones(agents), wrong(np.ones(agents))
+    for factors in ((0.0, *WEIGHTS), WEIGHTS, [w**0.25 for w in WEIGHTS], [w**0.0625 for w in WEIGHTS]):
+        for k in range(agents):
+            for factor in factors:
+                tried = np.where(np.arange(agents) == k, weights * factor, weights)
+                if (count := wrong(tried)) < least:
+                    weights, least = tried, count
+    if not weights.any():
+        return None
+    weights = weights / weights.max()
+    return replace_reads(one.cause, Over(read.part, "team", weights=tuple(round(float(w), 4) for w in weights)))
 
 
 @dataclass(frozen=True, eq=False)
