@@ -179,6 +179,18 @@ class BarrierScores(Part, frozen=True):
     maps: tuple[ProbeMap, ...] = ()
 
 
+class Played(Part, frozen=True):
+    """What drivers are predicted to come to, alone and under the shield, by somebody else than the barrier."""
+
+    driver: Literal["logged", "bold"]  # who does as the logs do, and who wants something and heeds nobody
+    judge: str  # networks on all entries, or nearness to danger
+    alone: float  # share of windows with a violation
+    guarded: float
+    error: float  # by which what the guard saves of them may be off, in 95 of 100 cases
+    unknown: tuple[float, float]  # share of steps that are far from all that was logged, alone and guarded
+    auroc: float  # of this judge, on held-out windows
+
+
 class Look(Part, frozen=True):
     """How guards look ahead by themselves, in rows."""
 
@@ -210,6 +222,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Verdict | None = None
     constraints: dict[str, BarrierScores] | None = None  # by name, where the logs name several
     look: Look | None = None  # None: of before; what reads a file decides it
+    played: tuple[Played, ...] = ()  # what guarded drivers are predicted to come to
     unread: dict[str, Any] = {}  # what else a file says of it
 
     def __hash__(self) -> int:
@@ -230,7 +243,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
         """The card as files hold it."""
         parts = msgspec.to_builtins(self)
         more = parts.pop("unread")
-        known = {name: value for name, value in parts.items() if value not in (None, {})}
+        known = {name: value for name, value in parts.items() if value not in (None, {}, ())}
         return _joined(known, more)
 
 
@@ -260,7 +273,7 @@ def summary(card: Card) -> list[str]:
     """The card as a person reads it, line by line."""
     if not card.data.task:
         return ["an empty card"]
-    lines = [*_of_data(card), *_of_prediction(card), *_of_barrier(card), *_of_verdict(card)]
+    lines = [*_of_data(card), *_of_prediction(card), *_of_barrier(card), *_of_played(card), *_of_verdict(card)]
     return [plain(line) for line in lines]  # which a file of anybody's may hold
 
 
@@ -362,6 +375,18 @@ def _of_barrier(card: Card) -> Iterator[str]:
         return
     for name, found in card.constraints.items():
         yield _of_constraint(name, (card.data.constraints or {}).get(name, UNKNOWN), found)
+
+
+def _of_played(card: Card) -> Iterator[str]:
+    shown = {"logged": "like those of the logs", "bold": "who heed nobody"}
+    for driver, words in shown.items():
+        rows = [row for row in card.played if row.driver == driver]
+        if rows:
+            each = ", ".join(f"by {r.judge} {percent(r.alone)} alone, {percent(r.guarded)} guarded" for r in rows)
+            yield (
+                f"Played inside the World, drivers {words} come to danger: {each}; of their guarded steps "
+                f"{percent(rows[0].unknown[1])} are far from all that was logged."
+            )
 
 
 def _of_verdict(card: Card) -> Iterator[str]:
