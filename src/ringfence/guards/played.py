@@ -31,33 +31,35 @@ from ringfence.utils.device import on_device
 from ringfence.world import World
 from ringfence.world.barrier import Shape, fit_label
 from ringfence.world.card import Played
+from ringfence.world.judging import Judging
 from ringfence.world.logged import Logged
 from ringfence.world.verdict import look_of
 
-WINDOWS = 96  # half of them of who does as the logs do
-STEPS = 40  # that each goes on for
+TOGETHER = 1500  # steps that are judged at once
+STEPS = 30  # that each goes on for
 AHEAD = 8  # steps for which who climbs rewards holds what it chooses among
 CHOICES = 16  # actions that it chooses among, at most
 STAYS = 0.9  # probability that who wants anything goes on wanting it for another step
 BANK = 2000  # held-out steps whose errors are drawn
-LEARNED = 20_000  # steps that drivers are learned from
-UNITS = 256  # that these are read through
+LEARNED = 8000  # steps that drivers are learned from
+UNITS = 128  # that these are read through
 RIDGE = 1e-3
-UPDATES = 1500  # of a judge's networks
+UPDATES = 1000  # of a judge's networks
 WIDTH = 32  # units of each of their layers
-KNOWN = 4000  # logged things of every kind that nearness is read from, and as many dangerous ones
+KNOWN = 1500  # logged things of every kind that nearness is read from, and as many dangerous ones
 NEAR = 0.35  # deviations of every entry: so near counts
-ROUNDS = 3  # in which nearness finds out who was to blame
-LOGGED = 600  # held-out windows that judges are calibrated on
+ROUNDS = 2  # in which nearness finds out who was to blame
+LOGGED = 1000  # held-out windows that judges are calibrated on
 USUAL = 0.99  # share of held-out steps that are as near to what was logged as is known
 ERROR = 1.645  # deviations: 95 in 100 lie below
 
-Judge = Callable[[Array, Array], Array]  # of steps from features (W, N, D) to others: (W,), more is more dangerous
+Judge = Callable[[Array, Array], Array]  # of steps from features (W, N, D) to others: (J, W), more is more dangerous
 
 
-def played(world: World, logged: Logged) -> tuple[Played, ...]:
+def played(world: World, logged: Logged, judging: Judging) -> tuple[Played, ...]:
     """What is predicted of both kinds of drivers by each judge; nothing of Worlds that know no danger."""
-    if world.barrier is None or world.card.barrier is None or world.card.barrier.warning:
+    scores = world.card.barrier
+    if not judging.played or world.barrier is None or scores is None or scores.warning:
         return ()
     rng = np.random.default_rng(5)
     begun, there = _windows(logged, rng)
@@ -66,17 +68,19 @@ def played(world: World, logged: Logged) -> tuple[Played, ...]:
     met = (label[steps] & there).any(1)
     if not met.any() or met.all():
         return ()
-    tracks = tracks_of(world, logged, rng)
+    tracks = tracks_of(world, logged, judging.played, rng)
     shares: list[Played] = []
-    apart, near = _nearness(world, logged, label, rng)
-    usual = np.quantile(_scores(apart, logged.before(steps), logged.after(steps))[there], USUAL)
-    unknown = [_scores(apart, rows[:, :-1], rows[:, 1:]) > usual for rows in tracks]
-    for name, judge in (("networks", _networks(world, logged)), ("nearness", near)):
-        worst = np.where(there, _scores(judge, logged.before(steps), logged.after(steps)), -np.inf).max(1)
+    judges = _networks(world, logged), _nearness(world, logged, label, rng)
+    sides = (logged.before(steps), logged.after(steps)), *((rows[:, :-1], rows[:, 1:]) for rows in tracks)
+    said = [np.concatenate([_scores(judge, *side) for judge in judges]) for side in sides]
+    usual = np.quantile(said[0][2][there], USUAL)
+    unknown = [each[2] > usual for each in said[1:]]
+    for name, of in (("networks", 0), ("nearness", 1)):
+        worst = np.where(there, said[0][of], -np.inf).max(1)
         chance = _calibrated(worst, met)
-        alone, guarded = (chance(_scores(judge, rows[:, :-1], rows[:, 1:]).max(1)) for rows in tracks)
-        half = len(alone) // 2
-        for driver, some in (("logged", slice(half)), ("bold", slice(half, None))):
+        alone, guarded = (chance(each[of].max(1)) for each in said[1:])
+        many = len(alone) * 2 // 3
+        for driver, some in (("logged", slice(many)), ("bold", slice(many, None))):
             saved = alone[some] - guarded[some]
             shares.append(
                 Played(
@@ -84,7 +88,7 @@ def played(world: World, logged: Logged) -> tuple[Played, ...]:
                     judge=name,
                     alone=round(float(alone[some].mean()), 4),
                     guarded=round(float(guarded[some].mean()), 4),
-                    error=round(float(ERROR * saved.std() / math.sqrt(half)), 4),
+                    error=round(float(ERROR * saved.std() / math.sqrt(len(saved))), 4),
                     unknown=tuple(round(float(each[some].mean()), 4) for each in unknown),
                     auroc=round(_auroc(worst[met], worst[~met]), 4),
                 )
@@ -120,14 +124,14 @@ def _auroc(high: np.ndarray, low: np.ndarray) -> float:
 
 
 def _scores(judge: Judge, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(W, K) of windows of steps, each (W, K, N, D), so many at once that judges are compiled once."""
+    """(J, W, K) of windows of steps, each (W, K, N, D), so many at once that judges are compiled once."""
     size = before.shape[:2]
-    together = len(after) and WINDOWS * 10
+    together = TOGETHER
     flat = [x.reshape(-1, *x.shape[2:]) for x in (before, after)]
     short = -len(flat[0]) % together
     parts = [np.concatenate([x, np.repeat(x[:1], short, 0)]).reshape(-1, together, *x.shape[1:]) for x in flat]
-    found = np.concatenate([np.asarray(judge(*map(on_device, part))) for part in zip(*parts)])
-    return found[: size[0] * size[1]].reshape(size)
+    found = np.concatenate([np.asarray(judge(*map(on_device, part))) for part in zip(*parts)], 1)
+    return found[:, : size[0] * size[1]].reshape(-1, *size)
 
 
 # --- judges ---
@@ -148,11 +152,11 @@ def _networks(world: World, logged: Logged) -> Judge:
 
 @eqx.filter_jit
 def _of_networks(net: eqx.Module, before: Array, after: Array) -> Array:
-    return -lowest(net.of_steps(before, after))
+    return -lowest(net.of_steps(before, after))[None]
 
 
-def _nearness(world: World, logged: Logged, label: np.ndarray, rng: np.random.Generator) -> tuple[Judge, Judge]:
-    """(how far a step is from all that was logged, how near to danger): by things, each in its own deviations, of the
+def _nearness(world: World, logged: Logged, label: np.ndarray, rng: np.random.Generator) -> Judge:
+    """How near a step is to danger, and how far from all that was logged: by things, each in its own deviations, of the
     agent and the thing that are in most of it."""
     shape = world.barrier.each[0].shape
     steps = logged.fitted_steps[logged.store.episode_of_step[logged.fitted_steps] % 2 == 1]
@@ -173,7 +177,7 @@ def _nearness(world: World, logged: Logged, label: np.ndarray, rng: np.random.Ge
         ends = np.cumsum([e.shape[1] for e in each])[:-1]
         blame = [part.reshape(w.shape) for part, w in zip(np.split(np.asarray(share), ends, 1), blame)]
     given = shape, units, banks, [on_device(w.ravel()) for w in blame], flat
-    return (lambda *step: _near(*given, *step)[0]), (lambda *step: _near(*given, *step)[1])
+    return lambda before, after: _near(*given, before, after)
 
 
 @eqx.filter_jit
@@ -185,14 +189,14 @@ def _near(
     safe: list[Array],
     before: Array,
     after: Array,
-) -> tuple[Array, Array]:
-    """(W,) how far steps are from the nearest that was logged, and how near to danger, by the worst thing."""
+) -> Array:
+    """(2, W) how near steps are to danger, and how far from the nearest that was logged, by the worst thing."""
     far, near = [], []
     for part, (mean, scale), bank, weight, fine in zip(_parts(shape, before, after), units, banks, blame, safe):
         read = ((part - mean) / scale).reshape(-1, part.shape[-1])
         for found, one in zip((far, near), _evidence(read, bank, weight, fine)):
             found.append(one.reshape(len(after), -1))
-    return jnp.concatenate(far, 1).max(1), jnp.concatenate(near, 1).max(1)
+    return jnp.stack([jnp.concatenate(each, 1).max(1) for each in (near, far)])
 
 
 @jax.jit
@@ -272,18 +276,18 @@ def _wanted(rng: np.random.Generator, windows: int, agents: int, dim: int) -> np
 # --- play ---
 
 
-def tracks_of(world: World, logged: Logged, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (W, K+1, N, D) of windows alone, and the same guarded: the first half by drivers like those of the logs,
+def tracks_of(world: World, logged: Logged, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (W, K+1, N, D) of windows alone, and the same guarded: the first two thirds by drivers like those of the logs,
     then who wants anything, then who climbs rewards."""
     card = replace(world.card, look=look_of(world.card))
     guard = build(None, dataclasses.replace(world, card=card), None, "shield", "learned", anyway=True).guard
     far = _far(logged)
-    x = on_device(logged.before(rng.choice(far, WINDOWS, replace=len(far) < WINDOWS)))
+    x = on_device(logged.before(rng.choice(far, count, replace=len(far) < count)))
     safe = logged.held_steps[~logged.unsafe[logged.held_steps]]
     bank = rng.choice(safe, BANK)
     steps = (on_device(x) for x in (logged.before(bank), logged.picked("actions", bank), logged.after(bank)))
-    wants = _wanted(rng, WINDOWS // 4, *logged.arrays["actions"].shape[1:])
-    drawn = rng.integers(0, BANK, (STEPS, WINDOWS))
+    wants = _wanted(rng, count * 5 // 6 - count * 2 // 3, *logged.arrays["actions"].shape[1:])
+    drawn = rng.integers(0, BANK, (STEPS, count))
     given = guard, _driver(world, logged, rng), x, on_device(wants), _errors(world, *steps), on_device(drawn)
     both = (np.moveaxis(np.asarray(_play(jnp.asarray(guarded), *given)), 0, 1) for guarded in (False, True))
     alone, guarded = (np.concatenate([np.asarray(x)[:, None], rows], 1) for rows in both)
@@ -310,7 +314,7 @@ def _play(guarded: Array, guard: Guard, driver: Driver, x: Array, wants: Array, 
     some = np.concatenate([np.zeros((1, wants.shape[-1])), directions(wants.shape[-1])])[:CHOICES]
     order = [np.random.default_rng(agent).permutation(len(some)) for agent in range(x.shape[1])]
     tried = jnp.asarray(some[np.stack(order, 1)], jnp.float32)  # (S, N, A)
-    middle, last = len(x) // 2, len(x) - len(x) // 4
+    middle, last = len(x) * 2 // 3, len(x) * 5 // 6
 
     def climbs(x: Array) -> Array:
         """What earns most by what is predicted, of what is held for a while."""

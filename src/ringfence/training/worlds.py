@@ -17,6 +17,7 @@ from ringfence.datasets.audit import odd_danger, odd_names
 from ringfence.datasets.make import make
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, NoWorld, UserError, whole_number
+from ringfence.guards.played import played
 from ringfence.guards.searched import false_safe
 from ringfence.logs.provenance import regenerated
 from ringfence.logs.resolution import require_resolved
@@ -138,6 +139,8 @@ def _judged(of: Fit) -> World:
         if card.barrier is not None:
             searched = false_safe(world, logged, judging.JUDGING)
             card = replace(card, barrier=replace(card.barrier, searched=searched))
+    with of.bar.part("play"):
+        card = replace(card, played=played(world, logged, judging.JUDGING))
     seconds = of.bar.seconds | {"in all": time.perf_counter() - begun}
     card = replace(card, seconds={name: round(took, 1) for name, took in seconds.items()})
     return dataclasses.replace(world, card=decided(card))

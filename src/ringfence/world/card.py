@@ -21,6 +21,7 @@ WIDENED = (5, 10, 15)  # rows ahead of which its words say what they ask for
 LITTLE = 0.05  # margins, of which they say nothing
 SHOWN = 3  # things that a barrier reads, beside distances, whose prediction its words show
 NO_CLIMB = ": guards that climb them (refine, full) are refused"
+DRIVERS = {"logged": "like those of the logs", "bold": "who heed nobody"}  # that a guard is played with, in words
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
 
 
@@ -378,8 +379,7 @@ def _of_barrier(card: Card) -> Iterator[str]:
 
 
 def _of_played(card: Card) -> Iterator[str]:
-    shown = {"logged": "like those of the logs", "bold": "who heed nobody"}
-    for driver, words in shown.items():
+    for driver, words in DRIVERS.items():
         rows = [row for row in card.played if row.driver == driver]
         if rows:
             each = ", ".join(f"by {r.judge} {percent(r.alone)} alone, {percent(r.guarded)} guarded" for r in rows)

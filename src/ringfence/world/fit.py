@@ -245,7 +245,7 @@ def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
     for _ in range(max(1, constraints) * settings.barrier):
         found += [("causes", 5.0)] * settings.causes
         found += [("label", settings.barrier_updates * 1.5e-3), ("future", settings.future_updates * 3e-3)]
-    return [*found, ("card", 8.0), ("search", 4.0)]
+    return [*found, ("card", 8.0), ("search", 4.0), ("play", 12.0)]
 
 
 # --- parts ---

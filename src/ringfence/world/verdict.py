@@ -12,7 +12,8 @@ from msgspec.structs import replace
 
 from ringfence.errors import UserError
 from ringfence.logs.late import Lateness
-from ringfence.world.card import FARTHEST, JUDGED, Avoidable, BarrierScores, Card, Look, Verdict
+from ringfence.utils.numbers import percent
+from ringfence.world.card import DRIVERS, FARTHEST, JUDGED, Avoidable, BarrierScores, Card, Look, Played, Verdict
 from ringfence.world.causes import Found
 
 Word = Literal["fit", "weak", "unfit"]
@@ -24,11 +25,16 @@ KEPT = (0.2, 0.6)  # share of safe steps that keep the margin: a guard fights mo
 FORESEEN = (0.5, 0.95)  # share of entries into danger that are predicted to have less than the margin
 AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could have avoided, as it predicts
 NOTHING = 1.0  # error of predictions as a share of what changes: to predict that nothing changes errs by as much
+CHANGES = 0.75  # the same one step ahead, from which on it predicts hardly anything
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
 UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
 LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V sees in time what they do not
 BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
+TRUSTED = 0.9  # AUROC of a judge on held-out windows, below which it is not heard
+RISKS = 0.02  # share of windows with a violation alone, below which drivers are no test of a guard
+LEAVES = 0.5  # of what drivers meet alone, that a guard may leave
+STRANGE = 0.75  # share of guarded steps far from all that was logged, from which on judges know nothing
 FORMULA = "give a formula of danger (hazard), e.g. where it is a sum or an area over the team"
 
 
@@ -52,6 +58,7 @@ def judge(card: Card) -> Verdict:
     scores = card.constraints or {"": card.barrier}
     for name, causes in card.causes.items():
         found += _told(causes, scores.get(name, card.barrier).recall, f" of '{name}'" if name else "")
+    found += of_played(card.played)
     found += _prediction(card)
     found += _late(Lateness(card.data.late))
     worst: Word = "fit"
@@ -126,6 +133,8 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
     ours = max(error.error_of_change, default=0.0)
     if ours > NOTHING:
         yield "unfit", f"its predictions err by {_times(ours)} as much as what they predict changes at all", remedy
+    elif error.error_of_change and error.error_of_change[0] >= CHANGES:
+        yield "weak", f"its predictions err by {error.error_of_change[0]:.0%} of what changes in a step", remedy
     if not error.coasting:
         return
     ours, theirs = error.error_of_change[-1], error.coasting[-1]
@@ -135,6 +144,26 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
             f"its predictions err by {ours:.0%} of what changes where constant velocity errs by {theirs:.0%}",
             remedy,
         )
+
+
+def of_played(rows: tuple[Played, ...]) -> Iterator[tuple[Word, str, str]]:
+    """What a guard is predicted to do to drivers, by judges who are worth hearing: it helps nobody where none of them
+    sees clearly fewer violations under it than without."""
+    remedy = "log what tells danger, and drivers who come nearer to it"
+    for driver, words in DRIVERS.items():
+        heard = [r for r in rows if r.driver == driver and r.auroc >= TRUSTED and r.alone >= RISKS]
+        if not heard:
+            continue
+        worst = max(heard, key=lambda r: r.guarded - r.alone)
+        said = f"drivers {words} are predicted to come to danger in {percent(worst.guarded)} of windows under guard"
+        beside = f"{said}, and in {percent(worst.alone)} without"
+        strange = worst.unknown[1] >= STRANGE
+        if strange:
+            yield "weak", f"{percent(worst.unknown[1])} of guarded steps of drivers {words} are unlike all logs", remedy
+        elif all(r.alone - r.guarded <= r.error for r in heard):
+            yield "unfit", beside, remedy
+        elif any(r.alone - r.guarded <= r.error or r.guarded > LEAVES * r.alone for r in heard):
+            yield "weak", beside, remedy
 
 
 def _late(late: Lateness) -> Iterator[tuple[Word, str, str]]:
