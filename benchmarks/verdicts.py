@@ -12,7 +12,6 @@ leaving each system out of the choice of thresholds says of it.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import time
 import warnings
@@ -29,7 +28,7 @@ from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS
 from ringfence.logs.store import EpisodeStore
 from ringfence.world import load, verdict
-from ringfence.world.card import Card, Played
+from ringfence.world.card import Played
 
 FILE = "verdict_played.json"
 SHORT = {"value_updates": 2000, "future_updates": 600, "dynamics_updates": 8000, "barrier_updates": 3000}

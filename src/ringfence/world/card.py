@@ -184,7 +184,7 @@ class Played(Part, frozen=True):
     """What drivers are predicted to come to, alone and under the shield, by somebody else than the barrier."""
 
     driver: Literal["logged", "bold"]  # who does as the logs do, and who wants something and heeds nobody
-    judge: str  # networks on all entries, or nearness to danger
+    judge: int  # networks on all entries, by one half of the episodes that are learned from or by the other
     alone: float  # share of windows with a violation
     guarded: float
     error: float  # by which what the guard saves of them may be off, in 95 of 100 cases
@@ -382,10 +382,11 @@ def _of_played(card: Card) -> Iterator[str]:
     for driver, words in DRIVERS.items():
         rows = [row for row in card.played if row.driver == driver]
         if rows:
-            each = ", ".join(f"by {r.judge} {percent(r.alone)} alone, {percent(r.guarded)} guarded" for r in rows)
+            each = ", or ".join(f"{percent(r.alone)} of windows alone and {percent(r.guarded)} guarded" for r in rows)
             yield (
-                f"Played inside the World, drivers {words} come to danger: {each}; of their guarded steps "
-                f"{percent(rows[0].unknown[1])} are far from all that was logged."
+                f"Played inside the World, drivers {words} come to danger in {each}, by judges who learned it anew "
+                f"(AUROC {', '.join(f'{r.auroc:.2f}' for r in rows)}); {percent(rows[0].unknown[1])} of guarded steps "
+                "are unlike all logs."
             )
 
 

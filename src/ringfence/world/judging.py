@@ -81,7 +81,7 @@ class Judging:
     searched: int = 128  # safe states from which a guard searches for what its World calls safe; 0: none
     corrections: int = 10  # of each of its searches
     restarts: int = 1  # likewise
-    played: int = 96  # windows in which its guard is played inside the World; 0: none
+    played: int = 80  # windows in which its guard is played inside the World; 0: none
 
 
 JUDGING = Judging()  # of all Worlds

@@ -32,7 +32,7 @@ LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V se
 BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
 TRUSTED = 0.9  # AUROC of a judge on held-out windows, below which it is not heard
-RISKS = 0.02  # share of windows with a violation alone, below which drivers are no test of a guard
+RISKS = 0.05  # share of windows with a violation alone, below which drivers are no test of a guard
 LEAVES = 0.5  # of what drivers meet alone, that a guard may leave
 STRANGE = 0.75  # share of guarded steps far from all that was logged, from which on judges know nothing
 FORMULA = "give a formula of danger (hazard), e.g. where it is a sum or an area over the team"
@@ -155,15 +155,15 @@ def of_played(rows: tuple[Played, ...]) -> Iterator[tuple[Word, str, str]]:
         if not heard:
             continue
         worst = max(heard, key=lambda r: r.guarded - r.alone)
-        said = f"drivers {words} are predicted to come to danger in {percent(worst.guarded)} of windows under guard"
-        beside = f"{said}, and in {percent(worst.alone)} without"
-        strange = worst.unknown[1] >= STRANGE
-        if strange:
+        helped = [r.alone - r.guarded > r.error for r in heard]
+        much = [r.guarded > LEAVES * r.alone for r in heard]
+        said = f"a guard is predicted to leave drivers {words} danger in {percent(worst.guarded)} of windows"
+        if worst.unknown[1] >= STRANGE:
             yield "weak", f"{percent(worst.unknown[1])} of guarded steps of drivers {words} are unlike all logs", remedy
-        elif all(r.alone - r.guarded <= r.error for r in heard):
-            yield "unfit", beside, remedy
-        elif any(r.alone - r.guarded <= r.error or r.guarded > LEAVES * r.alone for r in heard):
-            yield "weak", beside, remedy
+        elif all(much) and not any(helped):
+            yield "unfit", f"{said}, where they meet it in {percent(worst.alone)} without", remedy
+        elif any(much):
+            yield "weak", f"{said}, where they meet it in {percent(worst.alone)} without", remedy
 
 
 def _late(late: Lateness) -> Iterator[tuple[Word, str, str]]:
