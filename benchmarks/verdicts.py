@@ -12,6 +12,7 @@ leaving each system out of the choice of thresholds says of it.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import itertools
 import time
 import warnings
@@ -24,11 +25,15 @@ from proving import OTHERS, drawn, task_of
 from systems import MAPPED, SHAPED, TRACKED
 
 import ringfence
+from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS
+from ringfence.guards.played import played
 from ringfence.logs.store import EpisodeStore
-from ringfence.world import load, verdict
+from ringfence.world import World, impacts, load, verdict
 from ringfence.world.card import Played
+from ringfence.world.judging import JUDGING
+from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 
 FILE = "verdict_played.json"
 SHORT = {"value_updates": 2000, "future_updates": 600, "dynamics_updates": 8000, "barrier_updates": 3000}
@@ -40,7 +45,7 @@ FEW = 0.02  # episodes with a violation, alone, of drivers that are no test
 GRID = {
     "TRUSTED": (0.85, 0.9, 0.95),
     "RISKS": (0.01, 0.02, 0.05),
-    "STRANGE": (0.6, 0.75, 0.9),
+    "STRANGE": (0.5, 0.6, 0.75, 0.9),
     "LEAVES": (0.3, 0.5, 0.7),
 }
 
@@ -83,19 +88,28 @@ def row_of(name: str, worlds: Path | None) -> dict[str, Any]:
     """What is predicted, and what was counted, of a system."""
     file = None if worlds is None else worlds / f"{name}.safetensors"
     given = file is not None and file.exists()
+    store = store_of(name)
+    world = load(file) if given else ringfence.fit(store, **SHORT)
     begun = time.process_time()
-    world = load(file) if given else ringfence.fit(store_of(name), **SHORT)
-    card = world.card
+    card = msgspec.structs.replace(world.card, played=played_of(world, store))
     return {
         "world": "given" if given else "of fewer updates",
-        "cpu seconds": round(time.process_time() - begun, 1),
+        "cpu seconds of playing": round(time.process_time() - begun, 1),
         "before": verdict.judge(msgspec.structs.replace(card, played=())).word,
-        "after": verdict.judge(card).word,
-        "reasons": list(verdict.judge(card).reasons),
         "error of change": card.prediction_error.error_of_change[0],
         "played": msgspec.to_builtins(card.played),
         "counted": counted(name),
     }
+
+
+def played_of(world: World, store: EpisodeStore) -> tuple[Played, ...]:
+    """What its logs say of a World's guard."""
+    logs = registry.from_store(store).logs(store)
+    labels = labels_of(logs, world.map, world.card.settings, None)
+    logged = Logged.of(logs, world.map, held_out(logs, world.card.seed, unsafe_of(labels)), labels)
+    if world.card.data.impacts:
+        logged = impacts.landed(logged, dataclasses.replace(world.dynamics, ahead=None))
+    return played(world, logged, JUDGING)
 
 
 def harmful(row: dict[str, Any]) -> bool:
@@ -110,17 +124,17 @@ def refused(row: dict[str, Any]) -> str:
 
 
 def wrong(row: dict[str, Any], limits: dict[str, float]) -> bool:
-    """Whether a helpful guard is refused, or a harmful one is not so much as called weak."""
+    """Whether anything is said against a helpful guard, or nothing against a harmful one."""
     for name, value in limits.items():
         setattr(verdict, name, value)
     said = refused(row)
-    return said == "" if harmful(row) else said == "unfit"
+    return harmful(row) == (said == "")
 
 
 def left_out(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """By system: whether thresholds that the others chose err about it."""
     usual = {name: getattr(verdict, name) for name in GRID}
-    every = [usual, *(dict(zip(GRID, values)) for values in itertools.product(*GRID.values()))]
+    every = [dict(zip(GRID, values)) for values in itertools.product(*GRID.values())]
     found = {}
     for name, row in rows.items():
         others = [other for key, other in rows.items() if key != name]
@@ -129,6 +143,16 @@ def left_out(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
     for name, value in usual.items():
         setattr(verdict, name, value)
     return found
+
+
+def tell(name: str, rows: dict[str, dict[str, Any]]) -> None:
+    """Write all rows with what today's thresholds make of them, and print one."""
+    words = ("", "fit", "weak", "unfit")
+    for row in rows.values():
+        row["by play"] = refused(row) or "nothing"
+        row["after"] = max(row["before"], refused(row), key=words.index)
+    print(name, rows[name]["before"], "->", rows[name]["after"], rows[name]["counted"], flush=True)
+    keep(RESULTS / FILE, {"systems": rows, "left out": left_out(rows)})
 
 
 def main() -> None:
@@ -142,8 +166,8 @@ def main() -> None:
     for name in given.names or list(rows):
         if name not in rows or given.anew:
             rows[name] = row_of(name, given.worlds)
-            print(name, rows[name]["before"], "->", rows[name]["after"], rows[name]["counted"], flush=True)
-            keep(RESULTS / FILE, {"systems": rows, "left out": left_out(rows)})
+            tell(name, rows)
+    tell(next(iter(rows)), rows)
 
 
 if __name__ == "__main__":

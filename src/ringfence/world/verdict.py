@@ -147,23 +147,26 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
 
 
 def of_played(rows: tuple[Played, ...]) -> Iterator[tuple[Word, str, str]]:
-    """What a guard is predicted to do to drivers, by judges who are worth hearing: it helps nobody where none of them
-    sees clearly fewer violations under it than without."""
+    """What is amiss by what a guard is predicted to do. It helps nobody where no judge who is worth hearing sees
+    clearly fewer violations under it than without; where it leads drivers to what is unlike all logs, nobody knows."""
     remedy = "log what tells danger, and drivers who come nearer to it"
     for driver, words in DRIVERS.items():
-        heard = [r for r in rows if r.driver == driver and r.auroc >= TRUSTED and r.alone >= RISKS]
-        if not heard:
+        mine = [r for r in rows if r.driver == driver]
+        strange = max((r.unknown[1] for r in mine), default=0.0)
+        if strange >= STRANGE:
+            yield "weak", f"{percent(strange)} of guarded steps of drivers {words} are unlike all logs", remedy
+            continue  # what judges say of these is a guess
+        heard = [r for r in mine if r.auroc >= TRUSTED and r.alone >= RISKS]
+        much = [r for r in heard if r.guarded > LEAVES * r.alone]
+        if not much:
             continue
-        worst = max(heard, key=lambda r: r.guarded - r.alone)
-        helped = [r.alone - r.guarded > r.error for r in heard]
-        much = [r.guarded > LEAVES * r.alone for r in heard]
-        said = f"a guard is predicted to leave drivers {words} danger in {percent(worst.guarded)} of windows"
-        if worst.unknown[1] >= STRANGE:
-            yield "weak", f"{percent(worst.unknown[1])} of guarded steps of drivers {words} are unlike all logs", remedy
-        elif all(much) and not any(helped):
-            yield "unfit", f"{said}, where they meet it in {percent(worst.alone)} without", remedy
-        elif any(much):
-            yield "weak", f"{said}, where they meet it in {percent(worst.alone)} without", remedy
+        worst = max(much, key=lambda r: r.guarded - r.alone)
+        said = (
+            f"a guard is predicted to leave drivers {words} danger in {percent(worst.guarded)} of windows, where they "
+            f"meet it in {percent(worst.alone)} without"
+        )
+        helps = len(much) < len(heard) or any(r.alone - r.guarded > r.error for r in heard)
+        yield "weak" if helps else "unfit", said, remedy
 
 
 def _late(late: Lateness) -> Iterator[tuple[Word, str, str]]:
