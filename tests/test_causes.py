@@ -218,6 +218,74 @@ def test_what_has_room_for_one_is_dangerous_for_two():
     np.testing.assert_allclose(cause.of(jnp.asarray(x)), cause.of(x), atol=1e-5)
 
 
+def of_team(power: np.ndarray, more: np.ndarray) -> tuple:
+    """What `find` is given of steps (T, N) of powers and what else varies, of which nobody sees another's."""
+    x = np.stack([power, more], -1).astype(np.float32)
+    return x, np.arange(len(x)) // 30, ["own.power", "own.heat"]
+
+
+@pytest.mark.parametrize("weights", [(1.0, 1.0, 1.0), (0.5, 1.0, 0.25)])
+def test_danger_may_be_a_sum_over_the_team(weights):
+    """Of what each draws, and of some more than of others; who acts alone knows of no sum."""
+    rng = np.random.default_rng(0)
+    power = np.cumsum(rng.normal(0, 0.2, (9000, N)), 0) % 4.0
+    x, episode, names = of_team(power, rng.normal(size=power.shape))
+    unsafe = power @ weights > 0.7 * 4.0 * sum(weights)
+    found, _ = cause_search.find(x, unsafe, episode, names)
+    assert found.explained > 0.95 and found.false_alarms < 0.02
+    assert "over the team" in found.causes[0].name and "own.power" in found.causes[0].name
+    if len(set(weights)) > 1:
+        np.testing.assert_allclose(found.causes[0].reads[0].weights, weights, atol=0.06)
+    alone, _ = cause_search.find(x, unsafe, episode, names, team=False)
+    assert not any("team" in cause.name for cause in alone.causes)
+
+
+def test_thresholds_may_depend_on_other_numbers():
+    """Boxes as long as both are, side by side; and a limit that falls along a way."""
+    rng = np.random.default_rng(0)
+    long = rng.choice([4.0, 8.0], (9000, N))
+    offset = rng.normal(0, 1, (9000, N, N - 1, 2)) * [12.0, 3.0]
+    theirs = long[:, OTHERS]
+    touch = (np.abs(offset[..., 0]) < 0.5 * (long[..., None] + theirs)) & (np.abs(offset[..., 1]) < 1.8)
+    others = np.concatenate([offset, theirs[..., None]], -1).reshape(9000, N, -1)
+    x = np.concatenate([long[..., None], others], -1).astype(np.float32)
+    names = ["own.length", *(f"other{j}.{d}" for j in range(N - 1) for d in ("ds", "dd", "length"))]
+    found, _ = cause_search.find(x, touch.any((1, 2)), np.arange(9000) // 30, names)
+    (cause,) = found.causes
+    assert found.explained > 0.95 and "times own.length" in cause.name and "times other.length" in cause.name
+    (along,) = [one for one in cause.reads[0].parts if len(one.parts) == 3]
+    np.testing.assert_allclose(np.array(along.weights[1:]) / along.weights[0], -0.5, atol=0.03)
+    way, speed = rng.uniform(0, 300, (9000, N)), rng.uniform(4, 14, (9000, N))
+    x = np.stack([way, speed], -1).astype(np.float32)
+    fast = (speed > 12 - 0.02 * way).any(1)
+    found, _ = cause_search.find(x, fast, np.arange(9000) // 30, ["own.x", "own.vx"])
+    (cause,) = found.causes
+    assert found.explained > 0.98 and cause.is_rule
+    np.testing.assert_allclose(cause.reads[0].weights[1] / cause.reads[0].weights[0], 50.0, rtol=0.02)
+
+
+@pytest.mark.parametrize("what", ["three", "flat", "middle"])
+def test_danger_may_be_of_three_or_of_all(what):
+    """No three within a metre of each other; an area between them; how far the middle of all is."""
+    rng = np.random.default_rng(0)
+    place = rng.uniform(-1.4, 1.4, (20_000, 4, 2))
+    offset = place[:, others_of(4)] - place[:, :, None]
+    far = np.linalg.norm(place[:, None] - place[:, :, None], axis=-1)
+    trios = [(i, j, k) for i in range(4) for j in range(i) for k in range(j)]
+    widest = np.stack([np.max([far[:, i, j], far[:, i, k], far[:, j, k]], 0) for i, j, k in trios], -1)
+    one, two = (np.stack([place[:, t[m]] - place[:, t[0]] for t in trios], 1) for m in (1, 2))
+    area = 0.5 * np.abs(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0])
+    middle = np.linalg.norm(offset.sum(2) / 4, axis=-1)
+    unsafe = {"three": widest.min(1) < 0.8, "flat": area.min(1) < 0.02, "middle": middle.max(1) > 1.6}[what]
+    x = offset.reshape(20_000, 4, -1).astype(np.float32)
+    names = [f"other{j}.{d}" for j in range(3) for d in ("dx", "dy")]
+    found, _ = cause_search.find(x, unsafe, np.arange(20_000) // 30, names)
+    (cause,), (edge,) = found.causes, found.edges
+    assert found.explained > 0.95 and found.false_alarms < 0.05
+    assert edge.at == pytest.approx({"three": 0.8, "flat": 0.02, "middle": 6.4}[what], rel=0.05)
+    assert cause.things == (1 if what == "middle" else 3)
+
+
 def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
     names = ["other0.dx", "other0.dy", "own.cos", "own.sin"]
     ahead, angle = (

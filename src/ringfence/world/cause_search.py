@@ -45,7 +45,7 @@ ENOUGH = 0.98  # share of unsafe steps, and of safe ones, that causes tell, from
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
 ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too
-MOST_TERMS = 3  # that a threshold depends on
+NEEDLESS = 0.002  # share of the unsafe steps that a cause has to tell alone
 EPISODES = 2  # in which they have to be: one alone may be an accident
 
 
@@ -63,7 +63,24 @@ def find(
     alike = _siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
     chosen += [one for one, _ in alike]
     edges += [edge for _, edge in alike]
-    return replace(_summary(steps, chosen), edges=tuple(edges)), [one.cells for one in chosen]
+    called = [
+        _by_other_parts(steps, one, _without(steps, chosen, one)) if edge.bounds else one.called
+        for one, edge in zip(chosen, edges)
+    ]
+    kept = _needed(steps, called)
+    chosen, edges, called = ([each[k] for k in kept] for each in (chosen, edges, called))
+    return replace(_summary(steps, chosen, called), edges=tuple(edges)), [one.cells for one in chosen]
+
+
+def _needed(steps: Steps, called: list[np.ndarray]) -> list[int]:
+    """Which causes tell something that no other does, by the steps that each calls unsafe; those that tell least are
+    left out first. What was found by cells may be needless once edges are known."""
+    kept = list(range(len(called)))
+    for k in sorted(kept, key=lambda k: int((called[k] & steps.unsafe).sum())):
+        rest = [called[other] for other in kept if other != k]
+        if rest and (called[k] & steps.unsafe & ~np.logical_or.reduce(rest)).sum() <= NEEDLESS * steps.unsafe.sum():
+            kept.remove(k)
+    return kept
 
 
 def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
@@ -110,17 +127,14 @@ def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names:
 def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained) -> Counted:
     """The cause with thresholds that depend on other numbers, or a sum over the team with weights, where these tell
     clearly more: boxes as long as both are, limits that fall along a way."""
-    for _ in range(MOST_TERMS):
-        more = [one for one in beside(best.cause, names) if _varies(steps, one)]
-        tried = weighted_of(steps, best, explained), tilted_of(steps, best, explained, more)
-        found = [counted(steps, cause, explained) for cause in tried if cause is not None]
-        better = max(found, key=lambda one: one.gain, default=best)
-        more, error = gain(steps, explained.beside(best), better.safe)
-        less = gain(steps, explained.beside(better), best.safe)[0]
-        if better.gain < (1 + SIMPLER) * best.gain or more - less < SURE * error:
-            return best
-        best = better
-    return best
+    more = [one for one in beside(best.cause, names) if _varies(steps, one)]
+    tried = [*weighted_of(steps, best, explained), *tilted_of(steps, best, explained, more)]
+    found = [counted(steps, cause, explained) for cause in tried]
+    least = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
+    better = next((one for one in found if one.gain >= least), best)
+    gained, error = gain(steps, explained.beside(best), better.safe)
+    lost = gain(steps, explained.beside(better), best.safe)[0]
+    return better if better.gain > (1 + SIMPLER) * best.gain and gained - lost > SURE * error else best
 
 
 def _varies(steps: Steps, quantity: Quantity) -> bool:
@@ -275,15 +289,22 @@ def _tells_nearly_all(steps: Steps, one: Counted, explained: Explained) -> bool:
     left = explained.left > 0.5
     if not one.cells.edge.bounds or len(np.unique(steps.episode[left if left.ndim == 1 else left.any(1)])) < FEW:
         return False
-    safe = np.zeros(steps.unsafe.shape)
-    for fold in np.unique(steps.fold):
-        rest, own = steps.part(steps.fold != fold), steps.part(steps.fold == fold)
-        edge = refined(rest, one.cells.edge, one.cause, explained.of(rest, steps.fold != fold))
-        called = within(rest, one.cause, edge)
-        share = min(rest.unsafe[called].mean(), 0.999) if called.any() else 0.0
-        safe[steps.fold == fold] = np.where(within(own, one.cause, edge), np.log1p(-share), 0.0)
+    called = _by_other_parts(steps, one, explained)
+    share = min(steps.unsafe[called].mean(), 0.999) if called.any() else 0.0
+    safe = np.where(called, np.log1p(-share), 0.0)
     to_win = -explained.likelihood.mean() * (1 if steps.unsafe.ndim == 1 else steps.unsafe.shape[1])
     return gain(steps, explained, safe)[0] > NEARLY_ALL * to_win
+
+
+def _by_other_parts(steps: Steps, one: Counted, explained: Explained) -> np.ndarray:
+    """(T,) or (T, N) bool: in danger by a cause of one number, whose edges are read off the other episodes."""
+    found = np.zeros(steps.unsafe.shape, bool)
+    for fold in np.unique(steps.fold):
+        own = steps.fold == fold
+        rest = steps.part(~own)
+        edge = refined(rest, one.cells.edge, one.cause, explained.of(rest, ~own))
+        found[own] = within(steps.part(own), one.cause, edge)
+    return found
 
 
 def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
@@ -356,12 +377,15 @@ def _without(steps: Steps, chosen: list[Counted], one: Counted) -> Explained:
     return Explained.by(steps, [t for t in chosen if t is not one])
 
 
-def _summary(steps: Steps, chosen: list[Counted]) -> Found:
+def _summary(steps: Steps, chosen: list[Counted], called: Sequence[np.ndarray] = ()) -> Found:
+    """What causes tell, by the steps that each calls unsafe; by their cells where nothing else is said."""
+    called = called or [one.called for one in chosen]
+
     def explained(called: np.ndarray) -> tuple[float, float]:
         return float(called[steps.unsafe].mean()), float(called[~steps.unsafe].mean())
 
-    share, false_alarms = explained(np.logical_or.reduce([one.called for one in chosen]))
-    shares = tuple(round(explained(one.called)[0], 4) for one in chosen)
+    share, false_alarms = explained(np.logical_or.reduce(called))
+    shares = tuple(round(explained(each)[0], 4) for each in called)
     return Found(tuple(one.cause for one in chosen), round(share, 4), round(false_alarms, 4), shares)
 
 

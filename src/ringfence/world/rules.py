@@ -22,7 +22,8 @@ NEEDLESS = 0.002  # share of the unsafe steps by which a condition has to make f
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tried to be more or less, ever finer
 TRIED = (10, 3, 3, 3)  # such factors to either side
 WEIGHTS = (0.5, 0.7, 1.4, 2.0)  # times which an agent's weight in a sum is tried
-TILTS = tuple(0.01 * 2.0**k for k in range(8))  # of the deviation of what shifts a threshold
+MOST_TERMS = 3  # that a threshold depends on
+FEW = 30  # steps of either kind, below which no threshold is a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,43 +79,40 @@ def replace_reads(cause: Cause, read: Quantity) -> Cause:
     return Cause((read,), cause.who)
 
 
-def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Quantity]) -> Cause | None:
-    """The cause with one of its thresholds a line of one number more: the one that tells fewest steps wrongly."""
+def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Quantity]) -> Iterator[Cause]:
+    """The cause with one of its thresholds a line of one or a few numbers more: those that tell most of the steps."""
     conditions = _conditions(one)
-    if not conditions or not more:
-        return None
-    read = _read(steps, one, explained, SCREENED)[0]
-    tried = []
-    for k in range(len(conditions)):
-        near = _Near.of(read, one.cause, conditions, k)
-        for j, number in enumerate(more):
-            numbers = near.of_quantity(number)
-            if len(numbers) and numbers.std() > 0:
-                unit = float(near.values.std() / numbers.std())
-                weights = [sign * unit * size for sign in (1.0, -1.0) for size in TILTS]
-                tried += [(near.best(numbers, weight)[0], k, j, weight) for weight in weights]
-    if not tried:
-        return None
-    _, k, j, weight = min(tried)
-    near = _Near.of(_read(steps, one, explained)[0], one.cause, conditions, k)
-    numbers, at = near.of_quantity(more[j]), 0.0
-    for factor in RATIOS[1:]:
-        weights = [weight * factor**i for i in range(-3, 4)]
-        found = [near.best(numbers, each) for each in weights]
-        alike = [i for i, (wrong, _) in enumerate(found) if wrong == min(found)[0]]
-        weight, at = weights[alike[len(alike) // 2]], found[alike[len(alike) // 2]][1]
-    old = conditions[k]
-    new = Sum((*old.parts, more[j]), (*old.weights, float(weight)), float((old.more or 0.0) - at))
-    parts = (*conditions[:k], new, *conditions[k + 1 :])
-    return replace_reads(one.cause, parts[0] if len(parts) == 1 else All(parts))
+    some, whole = _read(steps, one, explained, SCREENED)[0], None
+    best: tuple[float, int, np.ndarray] | None = None
+    for k in range(len(conditions) if more else 0):
+        near = _Near.of(some, one.cause, conditions, k)
+        if min(near.bad.sum(), near.fine.sum()) >= FEW:
+            loss, weights = near.likeliest(np.stack([near.of_quantity(each) for each in more], -1))
+            if best is None or loss < best[0]:
+                best = loss, k, weights
+    if best is None:
+        return
+    _, k, weights = best
+    order = np.argsort(-np.abs(weights))
+    whole = _Near.of(_read(steps, one, explained)[0], one.cause, conditions, k)
+    for count in range(1, min(MOST_TERMS, int((weights != 0).sum())) + 1):
+        terms = [more[j] for j in order[:count]]
+        numbers = np.stack([whole.of_quantity(each) for each in terms], -1)
+        few = _Near.of(some, one.cause, conditions, k)
+        begun = few.likeliest(np.stack([few.of_quantity(each) for each in terms], -1), raw=True)[1]
+        found, at = whole.refined(numbers, begun)
+        old = conditions[k]
+        new = Sum((*old.parts, *terms), (*old.weights, *(float(w) for w in found)), float((old.more or 0.0) - at))
+        parts = (*conditions[:k], new, *conditions[k + 1 :])
+        yield replace_reads(one.cause, parts[0] if len(parts) == 1 else All(parts))
 
 
-def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Cause | None:
+def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause]:
     """A cause of a sum over the team with weights of agents by which fewest steps are told wrongly, each in turn."""
     (read,) = one.cause.reads[:1]
     agents = steps.x.shape[1]
     if one.cause.width > 1 or not isinstance(read, Over) or read.axis != "team" or read.rank or agents < 2:
-        return None
+        return
     told = _read(steps, one, explained)[0]
     team = told.bad if told.bad.ndim == 1 else told.bad.any(1)
     fine = told.fine if told.fine.ndim == 1 else told.fine.all(1)
@@ -133,9 +131,9 @@ def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Cause | Non
                 if (count := wrong(tried)) < least:
                     weights, least = tried, count
     if not weights.any():
-        return None
+        return
     weights = weights / weights.max()
-    return replace_reads(one.cause, Over(read.part, "team", weights=tuple(round(float(w), 4) for w in weights)))
+    yield replace_reads(one.cause, Over(read.part, "team", weights=tuple(round(float(w), 4) for w in weights)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +162,54 @@ class _Near:
     def of_quantity(self, quantity: Quantity) -> np.ndarray:
         return _of_picked(quantity, self.read.steps.x, self.read.agents, self.things)[self.at]
 
-    def best(self, numbers: np.ndarray, weight: float) -> tuple[int, float]:
-        """(steps that the condition tells wrongly with so much of these numbers, where danger begins)."""
-        worst = np.minimum.reduceat(self.values + np.float32(weight) * numbers, self.starts)
+    def likeliest(self, numbers: np.ndarray, raw: bool = False) -> tuple[float, np.ndarray]:
+        """(loss, weights (K,) of numbers (M, K), in deviations of each or as they are) by which the condition makes
+        steps likeliest: a noisy-or over all that is near, whose log-odds are linear."""
+        from scipy.optimize import minimize  # slow to import, and read by fits alone
+
+        spread = numbers.std(0)
+        usable = spread > 0
+        unit = float(self.values.std()) or 1.0
+        inputs = np.concatenate(
+            [self.values[:, None] / unit, (numbers - numbers.mean(0))[:, usable] / spread[usable]], -1
+        ).astype(np.float32)
+        share = np.where(self.bad, 0.5 / max(self.bad.sum(), 1), 0.5 / max(self.fine.sum(), 1)) * (self.bad | self.fine)
+        whose = np.repeat(np.arange(len(self.starts)), np.diff([*self.starts, len(self.values)]))
+
+        def loss(given: np.ndarray) -> tuple[float, np.ndarray]:
+            odds = np.clip(-(inputs @ given[:-1].astype(np.float32)) + given[-1], -30, 30).astype(np.float64)
+            chance = 1.0 / (1.0 + np.exp(-odds))
+            safe = np.add.reduceat(-np.logaddexp(0.0, odds), self.starts)  # log P(safe)
+            unsafe = np.log(np.maximum(-np.expm1(safe), 1e-12))
+            total = -(share * np.where(self.bad, unsafe, safe)).sum()
+            slope = share * np.where(self.bad, -np.exp(safe - unsafe), 1.0)  # by odds, over the chance of each
+            each = (slope[whose] * chance).astype(np.float32)
+            return total, np.array([*(-(each @ inputs)), each.sum()], np.float64) + 2e-4 * np.array([*given[:-1], 0.0])
+
+        begun = np.zeros(inputs.shape[1] + 1)
+        begun[0] = 5.0
+        found = minimize(loss, begun, jac=True, method="L-BFGS-B", options={"maxiter": 60})
+        weights = np.zeros(numbers.shape[1])
+        weights[usable] = found.x[1:-1] / max(abs(found.x[0]), 1e-6) * (unit / spread[usable] if raw else 1.0)
+        return float(found.fun), weights
+
+    def refined(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+        """Weights of numbers by which fewest steps are told wrongly, each in turn, and where danger begins."""
+        at = 0.0
+        for factor in RATIOS[1:]:
+            for k in range(len(weights)):
+                tried = [np.where(np.arange(len(weights)) == k, weights * factor**i, weights) for i in range(-3, 4)]
+                found = [self.best(numbers, each) for each in tried]
+                alike = [i for i, (wrong, _) in enumerate(found) if wrong == min(found)[0]]
+                weights, at = tried[alike[len(alike) // 2]], found[alike[len(alike) // 2]][1]
+        return weights, at
+
+    def best(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
+        """(steps that the condition tells wrongly with these weights of numbers, where danger begins)."""
+        worst = np.minimum.reduceat(self.values + numbers @ weights.astype(np.float32), self.starts)
         tried, wrong = told_wrong(np.sort(worst[self.bad]), np.sort(worst[self.fine]))
         best = int(wrong.argmin())
-        missed = int(self.read.bad.sum() - self.bad.sum())
-        return int(wrong[best]) + missed, float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
+        return int(wrong[best]), float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
 
 
 def _conditions(one: Counted) -> tuple[Sum, ...]:
