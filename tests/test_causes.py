@@ -255,7 +255,7 @@ def test_thresholds_may_depend_on_other_numbers():
     assert found.explained > 0.95 and "times own.length" in cause.name and "times other.length" in cause.name
     (along,) = [one for one in cause.reads[0].parts if len(one.parts) == 3]
     np.testing.assert_allclose(np.array(along.weights[1:]) / along.weights[0], -0.5, atol=0.03)
-    way, speed = rng.uniform(0, 300, (9000, N)), rng.uniform(4, 14, (9000, N))
+    way, speed = rng.uniform(0, 300, (9000, N)), rng.uniform(2, 11, (9000, N))
     x = np.stack([way, speed], -1).astype(np.float32)
     fast = (speed > 12 - 0.02 * way).any(1)
     found, _ = cause_search.find(x, fast, np.arange(9000) // 30, ["own.x", "own.vx"])

@@ -45,6 +45,7 @@ ENOUGH = 0.98  # share of unsafe steps, and of safe ones, that causes tell, from
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
 ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too
+SLANTED = 0.2  # share of the steps told wrongly that a threshold which depends on others has to tell rightly
 NEEDLESS = 0.002  # share of the unsafe steps that a cause has to tell alone
 EPISODES = 2  # in which they have to be: one alone may be an accident
 
@@ -63,10 +64,7 @@ def find(
     alike = _siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
     chosen += [one for one, _ in alike]
     edges += [edge for _, edge in alike]
-    called = [
-        _by_other_parts(steps, one, _without(steps, chosen, one)) if edge.bounds else one.called
-        for one, edge in zip(chosen, edges)
-    ]
+    called = [_by_other_parts(steps, one, _without(steps, chosen, one)) for one in chosen]
     kept = _needed(steps, called)
     chosen, edges, called = ([each[k] for k in kept] for each in (chosen, edges, called))
     return replace(_summary(steps, chosen, called), edges=tuple(edges)), [one.cells for one in chosen]
@@ -112,7 +110,14 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str],
     found = _as_rules(steps, found, shapes, names)
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
-    return found if more - less > SURE * error else chosen
+    worse = _wrong_together(steps, found) - _wrong_together(steps, chosen) > NEEDLESS * steps.unsafe.sum()
+    return found if not worse and more - less > SURE * error else chosen
+
+
+def _wrong_together(steps: Steps, chosen: list[Counted]) -> int:
+    """Steps that they tell wrongly."""
+    called = [_by_other_parts(steps, one, _without(steps, chosen, one)) for one in chosen]
+    return int((np.logical_or.reduce([np.zeros(steps.unsafe.shape, bool), *called]) != steps.unsafe).sum())
 
 
 def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names: Sequence[str]) -> list[Counted]:
@@ -134,7 +139,14 @@ def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explai
     better = next((one for one in found if one.gain >= least), best)
     gained, error = gain(steps, explained.beside(best), better.safe)
     lost = gain(steps, explained.beside(better), best.safe)[0]
-    return better if better.gain > (1 + SIMPLER) * best.gain and gained - lost > SURE * error else best
+    before, after = (_told_wrong(steps, one, explained) for one in (best, better))
+    fewer = before - after > max(SLANTED * before, NEEDLESS * steps.unsafe.sum())
+    return better if fewer and gained - lost > SURE * error else best
+
+
+def _told_wrong(steps: Steps, one: Counted, explained: Explained) -> int:
+    called = _by_other_parts(steps, one, explained)
+    return int(((explained.left > 0.5) & ~called).sum() + (~steps.unsafe & called).sum())
 
 
 def _varies(steps: Steps, quantity: Quantity) -> bool:
@@ -153,7 +165,8 @@ def _is_of_several(steps: Steps, cause: Cause) -> bool:
 
 def _tell_enough(steps: Steps, chosen: list[Counted]) -> bool:
     """Whether causes tell nearly all unsafe steps, and nearly all safe ones."""
-    told = _summary(steps, chosen) if chosen else Found(false_alarms=1.0)
+    called = [_by_other_parts(steps, one, _without(steps, chosen, one)) for one in chosen]
+    told = _summary(steps, chosen, called) if chosen else Found(false_alarms=1.0)
     return min(told.explained, 1.0 - told.false_alarms) > ENOUGH
 
 
@@ -162,16 +175,12 @@ def _as_rule(steps: Steps, one: Counted, pool: Sequence[Cause], explained: Expla
     its edges are known as well as those of a distance are. So are others that read the same entries."""
     about = one.cause.entries()
     alike = [counted(steps, cause, explained) for cause in pool if cause.width > 1 and cause.entries() == about]
-    best = counted(steps, one.cause, explained)
-    least = (1 - SIMPLER) * best.gain
-    for other in [best, *alike]:
-        if other.gain < least:
-            continue
-        for rule in rules_of(steps, other, explained):
-            tried = counted(steps, rule, explained)
-            if tried.gain > least:
-                best, least = tried, tried.gain
-    return best
+    own = counted(steps, one.cause, explained)
+    likely = [other for other in (own, *alike) if other.gain >= (1 - SIMPLER) * own.gain]
+    rules = [counted(steps, rule, explained) for other in likely for rule in rules_of(steps, other, explained)]
+    least = (1 - SIMPLER) * max(one.gain for one in (own, *rules))
+    enough = [rule for rule in rules if rule.gain >= least]
+    return min(enough, key=lambda rule: (len(rule.cause.reads[0].parts), -rule.gain), default=own)
 
 
 def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
@@ -297,7 +306,9 @@ def _tells_nearly_all(steps: Steps, one: Counted, explained: Explained) -> bool:
 
 
 def _by_other_parts(steps: Steps, one: Counted, explained: Explained) -> np.ndarray:
-    """(T,) or (T, N) bool: in danger by a cause of one number, whose edges are read off the other episodes."""
+    """(T,) or (T, N) bool: in danger by a cause; of one number its edges are read off the other episodes."""
+    if not one.cells.edge.bounds:
+        return one.called
     found = np.zeros(steps.unsafe.shape, bool)
     for fold in np.unique(steps.fold):
         own = steps.fold == fold
