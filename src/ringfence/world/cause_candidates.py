@@ -119,7 +119,7 @@ def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     reads = cause.reads if cause.vector is None else cause.vector
     if len(reads) >= WIDEST or any(not isinstance(one, Entry) for one in reads):
         return
-    known = {leaf.at for leaf in reads}
+    known = {leaf.at for read in reads for leaf in leaves(read)}
     for name, d in _own(names).items():
         if (d,) not in known:
             yield Cause((*reads, Entry((d,), name)), cause.who)
@@ -230,7 +230,7 @@ def _numbers(of: str, each: Fields) -> list[Quantity]:
     found: list[Quantity] = []
     for group in _groups(list(each[0])):
         entries = tuple(Entry(tuple(fields[field] for fields in each), of + field) for field in group)
-        found.append(Length(entries) if len(entries) > 1 else entries[0])
+        found += [Length(entries)] if len(entries) > 1 else entries
     return found
 
 

@@ -66,7 +66,8 @@ def find(
     edges += [edge for _, edge in alike]
     called = [_by_other_parts(steps, one, _without(steps, chosen, one)) for one in chosen]
     kept = _needed(steps, called)
-    chosen, edges, called = ([each[k] for k in kept] for each in (chosen, edges, called))
+    chosen, called = [chosen[k] for k in kept], [called[k] for k in kept]
+    edges = [edges[k] for k in kept]
     return replace(_summary(steps, chosen, called), edges=tuple(edges)), [one.cells for one in chosen]
 
 

@@ -88,8 +88,10 @@ class Cause(msgspec.Struct, frozen=True):
 
     def entries(self) -> tuple[frozenset[int], ...]:
         """(J,) the entries that it reads of each thing."""
-        read = [leaf.at for one in self.reads for leaf in leaves(one)]
-        return tuple(frozenset(at[j] if len(at) > 1 else at[0] for at in read) for j in range(self.things))
+        read = [np.array(leaf.at) for one in self.reads for leaf in leaves(one)]
+        each = (at if len(at) == self.things > 1 else np.tile(at, (self.things, 1)).T for at in read)
+        rows = np.concatenate([at.reshape(-1, self.things) for at in each])
+        return tuple(frozenset(rows[:, j].tolist()) for j in range(self.things))
 
     def of(self, x: Any) -> Any:
         """(..., J, width) what it reads of features (..., D), NumPy's or JAX's."""

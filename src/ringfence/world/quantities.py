@@ -8,6 +8,7 @@ another, of which it gives all that a quantity can be.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -60,10 +61,8 @@ class Length(msgspec.Struct, frozen=True, tag=True):
     def words(self) -> str:
         if len(self.parts) == 1:
             return f"|{self.parts[0].words}|"
-        kinds = {part.words.partition(".d")[0] for part in self.parts}
-        if len(kinds) == 1 and all(".d" in part.words for part in self.parts):
-            return f"{kinds.pop()}.distance"
-        return f"length of {', '.join(part.words for part in self.parts)}"
+        kind = _thing_at([part.words for part in self.parts])
+        return f"{kind}.distance" if kind else f"length of {', '.join(part.words for part in self.parts)}"
 
 
 class Closing(msgspec.Struct, frozen=True, tag=True):
@@ -110,7 +109,7 @@ class Turned(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def words(self) -> str:
-        kind = self.offset[0].words.partition(".d")[0]
+        kind = _thing_at([part.words for part in self.offset])
         return f"angle to {kind}" if self.what == "angle" else f"{kind}.{self.what}"
 
 
@@ -219,13 +218,13 @@ def varies(quantity: Quantity, entries: np.ndarray) -> np.ndarray:
     """(N, J) bool: of which agents and things all that it reads varies, by the entries (N, D) that do."""
     if isinstance(quantity, Entry):
         return entries[:, list(quantity.at)]
-    found = varies(quantity.parts[0], entries)
-    for part in quantity.parts[1:]:
+    found = np.ones((len(entries), 1), bool)
+    for part in quantity.parts:
         found = found & varies(part, entries)
     if isinstance(quantity, Over):
         found = found.all(-1, keepdims=True)
-        return np.broadcast_to(found.any(0), found.shape) if quantity.axis == "team" else found
-    return found
+        found = found | (quantity.axis == "team" and bool(found.any()))
+    return np.asarray(found)
 
 
 def from_zero(quantity: Quantity) -> bool:
@@ -253,6 +252,13 @@ def below(quantity: Quantity, x: Between) -> tuple[Any, Any]:
     """The least and the most that it is of all features between (..., N, D)."""
     found = quantity.of(x)
     return found.low, found.high
+
+
+def _thing_at(words: Sequence[str]) -> str:
+    """What kind of thing is at an offset that is called so, e.g. other.dx and other.dy; "" where it is none."""
+    found = [re.fullmatch(r"(.*)\.d(\w)", one) for one in words]
+    kinds = {match[1] for match in found if match}
+    return kinds.pop() if all(found) and len(kinds) == 1 else ""
 
 
 def _term(words: str, weight: float, k: int) -> str:

@@ -141,7 +141,7 @@ class _Near:
     """The agents and things of steps for which all conditions but one hold, one after the other."""
 
     read: _Read
-    at: tuple[np.ndarray, np.ndarray]  # step and which of the agents and things
+    at: tuple[np.ndarray, ...]  # step and which of the agents and things
     things: np.ndarray  # (P,) of which agents' things
     values: np.ndarray  # of the one condition
     starts: np.ndarray  # where those of another step, or of another agent in it, begin
@@ -238,7 +238,7 @@ def _read(steps: Steps, one: Counted, explained: Explained, most: int = MOST_REA
     cells = one.cells
     agents, things = np.nonzero(one.cause.holds(steps.x.shape[1]))
     left = explained.left > 0.5
-    kept = left if left.ndim == 1 else left.any(1)
+    kept = np.asarray(left if left.ndim == 1 else left.any(1))
     room = max(1, most // (len(agents) * cells.cause.width))
     kept = _thinned(kept, room // 2) | _thinned(~kept, room - min(kept.sum(), room // 2))
     scale = np.maximum(cells.high - cells.low, 1e-9)
