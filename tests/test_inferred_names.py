@@ -13,6 +13,7 @@ from ringfence.problem.entries import loosely
 from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.others import others as others_of
 from ringfence.training import worlds
+from ringfence.world.card import Card, Data, HeldOut, summary
 from tests.quick import QUICK_WORLD
 
 DT = 0.1
@@ -200,6 +201,17 @@ def test_given_names_tell_places_from_other_differences(backwards):
     assert on_map.relative(x[..., swapped], names, None, first).names == tuple(true[d] for d in swapped)
 
 
+def test_numbers_of_others_are_theirs_where_these_have_them():
+    x, given, true, first = trucks()
+    load = np.broadcast_to(np.array([1.0, 1.0, 5.0], np.float32)[:, None], (len(x), 3, 1))  # of each its own, always
+    theirs = load[:, others_of(3), 0]
+    more = ("load", "truck0_load", "truck1_load")
+    found = on_map.relative(np.concatenate([x, load, theirs], -1), (*given, *more), None, first).names
+    assert found == (*true, "own.load", "other0.load", "other1.load")
+    found = on_map.relative(np.concatenate([x, load, theirs[..., ::-1]], -1), (*given, *more), None, first).names
+    assert found == (*true, *more), "they are not"
+
+
 def test_given_names_that_logs_refute_name_nothing():
     x, given, _, first = trucks()
     noisy = x.copy()
@@ -251,5 +263,14 @@ def test_the_card_says_which_names_were_inferred_and_a_formula_reads_them(own_st
     for entry, name in world.card.data.inferred_names.items():
         true = given[int(entry.removeprefix("obs"))]
         assert name == true or (name.startswith("still_") and true.startswith("landmark"))
-    assert "Logs tell what these entries are" in str(world.card) and "other0.dx (obs" in str(world.card)
+    assert "Logs tell what these entries are, which nobody named: " in str(world.card)
+    assert "other0.dx (obs" in str(world.card) and "by other names" not in str(world.card)
     assert worlds.fit(own_store, **QUICK_WORLD).card.data.inferred_names is None
+
+
+def test_the_card_says_which_given_names_are_read_otherwise():
+    said = {"s": "own.x", "obs3": "own.vx", "truck0_speed less speed": "other0.dv"}
+    card = Card(data=Data(task="t", hazard={}, inferred_names=said), held_out=HeldOut(1, 1))
+    lines = summary(card)
+    assert "Logs tell what these entries are, which nobody named: own.vx (obs3)." in lines
+    assert any(line.endswith("than given: own.x (s), other0.dv (truck0_speed less speed).") for line in lines)

@@ -165,10 +165,10 @@ def odd_costs(store: EpisodeStore) -> list[str]:
 
 
 def _odd_observations(store: EpisodeStore) -> list[str]:
-    """Entries that never vary."""
+    """Entries that never vary, nor from agent to agent."""
     warnings = []
     some = store.observations[:: max(1, len(store.observations) // 100_000)]
-    constant = np.flatnonzero(np.ptp(some, axis=0).max(0) < 1e-9)  # for no agent
+    constant = np.flatnonzero(np.ptp(some, axis=(0, 1)) < 1e-9)
     if len(constant):
         names = store.card.observation_names
         which = ", ".join(f"{d} ({names[d]})" if names else str(d) for d in constant)

@@ -65,6 +65,7 @@ def inferred_names(
     found |= dict(_still(steps, moving, set(found)))
     found |= _heading(steps, found, Entries.of([f"own.{name}" for name in names]).direction)
     found |= dict(_differences(fields, found))
+    found |= dict(_numbers(steps, found, names))
     found |= dict(_things(steps, found))
     found |= _as_given(found, names)
     return tuple(name if name in keep else found.get(entry, name) for entry, name in enumerate(names))
@@ -227,6 +228,30 @@ def _differences(fields: Sequence[_Field], found: Mapping[int, str]) -> Iterator
         name = "" if f.own is None else found.get(f.own, "")
         if name.startswith("own.") and not any(entry in found for entry in f.entries):
             yield from ((entry, f"other{k}.d{name[4:]}") for k, entry in enumerate(f.entries))
+
+
+def _numbers(steps: Steps, found: Mapping[int, str], names: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """What names call alike of oneself and of each of the others who are known, e.g. `load` and `truck0_load`, where it
+    is what these have themselves."""
+    x = steps.before
+    if "other0.dx" not in found.values():
+        return
+    called: dict[tuple[str, str], dict[int, int]] = {}
+    for entry, name in enumerate(names):
+        if entry not in found and (match := re.fullmatch(r"(\w*?[A-Za-z])_?(\d{1,9})[._](\w*[A-Za-z])", name)):
+            called.setdefault((match[1], match[3]), {})[int(match[2])] = entry
+    for (_, what), each in called.items():
+        entries = [each[k] for k in sorted(each)]
+        own = names.index(what) if what in names else None
+        if own is None or own in found or len(entries) != x.shape[1] - 1:
+            continue
+        if all(steps.equal(x[:, i, entries[j - (j > i)]], x[:, j, own], own) for i, j in _both_ways(x.shape[1])):
+            yield own, f"own.{what}"
+            yield from ((entry, f"other{k}.{what}") for k, entry in enumerate(entries))
+
+
+def _both_ways(agents: int) -> Iterator[tuple[int, int]]:
+    return ((i, j) for i in range(agents) for j in range(agents) if i != j)
 
 
 def _of_axis(steps: Steps, place: _Field, axis: str) -> dict[int, str]:
