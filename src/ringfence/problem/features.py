@@ -433,6 +433,8 @@ def _pruned_map(
         # One index table needs one source: of a pruned view, observations with the state appended to each of them.
         columns = columns + shared
         seen = seen.with_entries(range(width, width + len(shared)), state_names)
+    # of others the agent's own number of that kind tells as much, and of some of them alone it would tell them apart
+    known |= {d for d, name in enumerate(seen.names) if name.startswith("other") and _constant_in_each(columns[d])}
     kept = _some(_telling(columns, known))
     plus, minus = seen.plus[:, kept], seen.minus[:, kept]
     kind = FeatureMap
@@ -568,6 +570,11 @@ def _constant(column: np.ndarray, rows: int = 10_000) -> bool:
     """Whether a column (M, N) never varies, nor from agent to agent: what is another number for each tells who is of
     which kind. Most vary at once, so the first rows are asked first."""
     return all(np.ptp(some) < 1e-9 for some in (column[:rows], column))
+
+
+def _constant_in_each(column: np.ndarray, rows: int = 10_000) -> bool:
+    """Whether a column (M, N) never varies for any agent."""
+    return all(np.ptp(some, axis=0).max() < 1e-9 for some in (column[:rows], column))
 
 
 def _same(a: np.ndarray, b: np.ndarray, rows: int = 10_000) -> bool:
