@@ -171,16 +171,6 @@ def test_views_of_other_teams(agents):
         assert x.shape == (4, agents, width[view]) and len(set(table.names)) == len(table.names) == width[view]
 
 
-def test_views_keep_what_tells_agents_apart():
-    """Of oneself: what is so of the others follows from it."""
-    observations = np.random.default_rng(0).normal(size=(50, 3, 4))
-    observations[..., 1] = [1.0, 1.0, 0.0]
-    observations[..., 2] = [1.0, 1.0, 1.0]
-    observations[..., 3] = [0.0, 0.0, 1.0]
-    names = ("own.x", "own.is_truck", "own.wheels", "other1.is_truck")
-    assert features.from_data("pruned", observations, None, names, ()).names == names[:2]
-
-
 def test_views_of_anybodys_data_drop_constants_and_duplicates():
     rng = np.random.default_rng(0)
     observations, state = rng.normal(size=(50, 2, 4)), rng.normal(size=(50, 3))

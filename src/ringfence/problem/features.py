@@ -370,10 +370,10 @@ def from_data(
     dt: float | None = None,
     team: bool = False,
 ) -> FeatureMap:
-    """The views of anybody's data: entries that never vary, nor differ between agents, or repeat an earlier one for
-    every agent, are pruned, and so are entries of the state that every agent's observation tells already, in other
-    coordinates (but for those in `keep`). Where names tell how entries follow from others (`derived`) and the logged
-    steps agree, they do. Entries without names have those that follow from logs (problem/inferred_names.py).
+    """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
+    so are entries of the state that every agent's observation tells already, in other coordinates (but for those in
+    `keep`). Where names tell how entries follow from others (`derived`) and the logged steps agree, they do. Entries
+    without names have those that follow from logs (problem/inferred_names.py).
 
     observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
     that vary only later on. `first_rows` (E,) are those that episodes begin with. `dt` is the seconds between rows, of
@@ -433,8 +433,6 @@ def _pruned_map(
         # One index table needs one source: of a pruned view, observations with the state appended to each of them.
         columns = columns + shared
         seen = seen.with_entries(range(width, width + len(shared)), state_names)
-    # of others the agent's own number of that kind tells as much, and of some of them alone it would tell them apart
-    known |= {d for d, name in enumerate(seen.names) if name.startswith("other") and _constant_in_each(columns[d])}
     kept = _some(_telling(columns, known))
     plus, minus = seen.plus[:, kept], seen.minus[:, kept]
     kind = FeatureMap
@@ -567,13 +565,7 @@ def _observed_too(
 
 
 def _constant(column: np.ndarray, rows: int = 10_000) -> bool:
-    """Whether a column (M, N) never varies, nor from agent to agent: what is another number for each tells who is of
-    which kind. Most vary at once, so the first rows are asked first."""
-    return all(np.ptp(some) < 1e-9 for some in (column[:rows], column))
-
-
-def _constant_in_each(column: np.ndarray, rows: int = 10_000) -> bool:
-    """Whether a column (M, N) never varies for any agent."""
+    """Whether a column (M, N) never varies for any agent. Most vary at once, so the first rows are asked first."""
     return all(np.ptp(some, axis=0).max() < 1e-9 for some in (column[:rows], column))
 
 
