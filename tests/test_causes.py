@@ -32,12 +32,14 @@ from ringfence.world import (
     verdict,
 )
 from ringfence.world.card import (
+    PUT,
     Avoidable,
     BarrierScores,
     Card,
     Data,
     Foresight,
     PredictionError,
+    Probe,
     ValueScores,
     Verdict,
 )
@@ -655,13 +657,22 @@ def test_a_world_that_is_unfit_is_refused_unless_one_insists():
 def test_verdicts_give_their_reasons():
     good = BarrierScores(entries=100, recall=0.99, margin_kept=0.9, probed=1.0)
     data = Data(task="t", hazard={})
-    assert verdict.judge(Card(data=data, barrier=good)) == Verdict("fit")
+    carried = ("99.0% of unsafe steps are found", "90.0% of safe steps keep the margin")
+    assert verdict.judge(Card(data=data, barrier=good)) == Verdict("fit", carried)
+    assert str(Verdict("fit", carried)) == f"fit: {carried[0]}; {carried[1]}"
+    near = Probe(name="length of other.dx" + PUT, at=(), scores=(), edge=1.25, unsafe=(0.5,))
+    put = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, probed=0.5, probes=(near,))))
+    assert "something put nearer than 1.25 (length of other.dx) are called unsafe" in put.reasons[0]
     cases = (
         (dict(entries=10), "weak", "only 10 held-out steps enter danger"),
         (dict(entries=2), "unfit", "only 2 held-out steps enter danger"),
         (dict(recall=0.5), "unfit", "only 50.0% of unsafe steps are found"),
         (dict(margin_kept=0.01), "unfit", "only 1.0% of safe steps keep the margin"),
-        (dict(probed=0.5), "unfit", "only 50.0% of states inside the radius are called unsafe"),
+        (
+            dict(probed=0.5),
+            "unfit",
+            "only 50.0% of states with something put nearer than danger begins are called unsafe",
+        ),
         (dict(warning="no held-out step is unsafe"), "unfit", "no held-out step is unsafe"),
     )
     for changes, word, reason in cases:
@@ -681,6 +692,8 @@ def test_verdicts_give_their_reasons():
         missed = msgspec.structs.replace(good, recall=0.5)
         found = verdict.judge(Card(data=data, barrier=missed, prediction_error=known))
         assert found.remedies[0].startswith(remedy)
+    both = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(missed, probed=0.5), prediction_error=known))
+    assert len(both.reasons) == 2 and str(both).count("give a formula of danger") == 1, "no remedy is said twice"
     for error, word, reason in (
         (0.95, "weak", "constant velocity errs by 90%"),
         (1.3, "unfit", "err by 1.3 times as much as what they predict changes at all"),

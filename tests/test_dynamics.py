@@ -54,6 +54,19 @@ def test_it_learns_what_actions_do(joint):
     assert apart.mean() > 3 * spread.mean()  # where the logs have not been, the members disagree
 
 
+def test_what_never_changes_within_an_episode_is_left_alone():
+    features, actions, row = log(False)
+    length = jnp.repeat(jax.random.uniform(jax.random.key(1), (EPISODES, 1)), STEPS + 1, 0)[..., None]
+    long = jnp.concatenate([features, jnp.broadcast_to(length, (*features.shape[:2], 1))], -1)
+    map = replace(view(False), names=("x", "v", "length"))
+    settings = Settings(num_ensemble=2, dynamics_updates=20, dynamics_width=8)
+    dynamics = fit_dynamics(long, actions, row, map, jax.random.key(0), settings)
+    foreseen, _ = dynamics.step(long[row] + 1.0, actions)
+    assert (foreseen[..., 2] == long[row, :, 2] + 1.0).all()
+    once = long.at[-1, 0, 2].add(0.1)  # it changes in one step
+    assert (fit_dynamics(once, actions, row, map, jax.random.key(0), settings).step_scale > 0).all()
+
+
 def test_agents_that_do_not_share_a_body_do_not_read_each_other():
     dynamics = blank_dynamics(view(False), 1, 2, 8)
     x, action = jnp.ones((3, AGENTS, 2)), jnp.ones((3, AGENTS, 1))

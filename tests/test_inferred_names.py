@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
+from ringfence.problem import on_map
+from ringfence.problem.entries import loosely
 from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.others import others as others_of
 from ringfence.training import worlds
+from ringfence.world.card import Card, Data, HeldOut, summary
 from tests.quick import QUICK_WORLD
 
 DT = 0.1
@@ -137,6 +140,13 @@ def test_what_is_measured_has_no_names():
     assert inferred_names(x[:20], numbers(len(true)), first[:1]) == numbers(len(true))
 
 
+def test_what_names_may_mean():
+    said = {"x": ("place", "x"), "robot0_dvy": ("drift", "y"), "post1X": ("place", "x"), "goal.dz": ("offset", "z")}
+    said |= {"ego_vel_x": ("velocity", "x"), "delta_x": ("offset", "x"), "truck0_speed": ("number", "")}
+    said |= {"cos": ("number", ""), "index": (None, ""), "obs7": (None, ""), "power_kw": (None, "")}
+    assert {name: loosely(name) for name in said} == said
+
+
 def test_a_view_without_names_is_one_with_them():
     bare = DEVELOPMENT["room"]
     bare, named = (dataclasses.replace(bare, names=names).feature_map("pruned") for names in ("none", "all"))
@@ -157,6 +167,75 @@ def test_names_that_say_nothing_of_whose_an_entry_is_give_way():
     assert inferred_names(x, given, first, keep=("column 1",)) == ("column 0", "column 1", *expected[2:])
     half = tuple("own.vx" if name == "own.vx" else entry for name, entry in zip(true, given))
     assert inferred_names(x, half, first) == half
+
+
+def trucks(backwards: bool = False) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...], np.ndarray]:
+    """Observations of three bodies that turn, what they are called, what they are, and the first rows."""
+    g = np.random.default_rng(0)
+    shape = (20, 31, 3)
+    turn = g.normal(size=shape).cumsum(1) * 0.1
+    pace = g.normal(size=shape).cumsum(1) * 0.2
+    pace = pace if backwards else 0.1 + np.abs(pace)
+    look = np.stack([np.cos(turn), np.sin(turn)], -1)
+    place = g.normal(size=(20, 1, 3, 2)) * 3 + DT * (pace[..., None] * look).cumsum(1)
+    who = others_of(3)
+    gap = place[:, :, who] - place[:, :, :, None]
+    seen = np.concatenate([gap, look[:, :, who], pace[:, :, who, None]], -1)
+    x = np.concatenate([place, look, pace[..., None], seen.reshape(*shape, -1)], -1)
+    own = ("x", "y", "cos", "sin", "speed")
+    given = (*own, *(f"truck{k}_{e}" for k in range(2) for e in ("dx", "dy", "cos", "sin", "speed")))
+    true = ["own.x", "own.y", "own.cos", "own.sin", "own.v"]
+    true += [f"other{k}.{e}" for k in range(2) for e in ("dx", "dy", "dcos", "dsin", "dv")]
+    return x.reshape(-1, *x.shape[2:]).astype(np.float32), given, tuple(true), np.arange(20) * 31
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_given_names_tell_places_from_other_differences(backwards):
+    """Others' headings and speeds differ from one's own as exactly as their places do."""
+    x, given, true, first = trucks(backwards)
+    columns = on_map.relative(x, given, None, first)
+    assert columns.names == true
+    swapped = np.arange(len(true))
+    swapped[[5, 6]] = 6, 5
+    names = tuple(given[d] for d in swapped)
+    assert on_map.relative(x[..., swapped], names, None, first).names == tuple(true[d] for d in swapped)
+
+
+def test_numbers_of_others_are_theirs_where_these_have_them():
+    x, given, true, first = trucks()
+    load = np.broadcast_to(np.array([1.0, 1.0, 5.0], np.float32)[:, None], (len(x), 3, 1))  # of each its own, always
+    theirs = load[:, others_of(3), 0]
+    more = ("load", "truck0_load", "truck1_load")
+    found = on_map.relative(np.concatenate([x, load, theirs], -1), (*given, *more), None, first).names
+    assert found == (*true, "own.load", "other0.load", "other1.load")
+    found = on_map.relative(np.concatenate([x, load, theirs[..., ::-1]], -1), (*given, *more), None, first).names
+    assert found == (*true, *more), "they are not"
+
+
+def test_given_names_that_logs_refute_name_nothing():
+    x, given, _, first = trucks()
+    noisy = x.copy()
+    noisy[..., 5:7] += np.random.default_rng(1).normal(size=noisy[..., 5:7].shape)
+    found = on_map.relative(noisy, given, None, first).names
+    assert found[5:7] == given[5:7] and not any(name.startswith("other0.") for name in found[5:7])
+    moved = inferred_names(x[..., [2, 7, 12]], ("x", "truck0_dvx", "truck1_dvx"), first)
+    assert not any(name.endswith(".dx") for name in moved), "a velocity by its name is no place"
+
+
+def test_offsets_by_their_names_are_no_places_on_a_map():
+    """Nor where all go along with each other, so that they do not change as one moves."""
+    x, true, first = team()
+    together = np.random.default_rng(3).normal(size=(20, 31, 1, 2)).cumsum(1)
+    x = x.reshape(20, 31, *x.shape[1:])
+    x[..., 5:7] += together
+    x[..., 3:5] -= together
+    x[..., 1:3] += np.diff(together, axis=1, prepend=0) / DT
+    x = x.reshape(-1, *x.shape[2:])
+    own = ["charge", "vx", "vy", "goal_dx", "goal_dy", "x", "y"]
+    given = own + [f"robot{k}_{e}" for k in range(2) for e in ("dx", "dy", "dvx", "dvy")]
+    columns = on_map.relative(x, given, None, first)
+    assert not columns.differ
+    assert columns.names == ("charge", *(name.replace("still_a", "goal") for name in true[1:]))
 
 
 def test_things_are_called_as_given_names_call_them():
@@ -184,5 +263,14 @@ def test_the_card_says_which_names_were_inferred_and_a_formula_reads_them(own_st
     for entry, name in world.card.data.inferred_names.items():
         true = given[int(entry.removeprefix("obs"))]
         assert name == true or (name.startswith("still_") and true.startswith("landmark"))
-    assert "Logs tell what these entries are" in str(world.card) and "other0.dx (obs" in str(world.card)
+    assert "Logs tell what these entries are, which nobody named: " in str(world.card)
+    assert "other0.dx (obs" in str(world.card) and "by other names" not in str(world.card)
     assert worlds.fit(own_store, **QUICK_WORLD).card.data.inferred_names is None
+
+
+def test_the_card_says_which_given_names_are_read_otherwise():
+    said = {"s": "own.x", "obs3": "own.vx", "truck0_speed less speed": "other0.dv"}
+    card = Card(data=Data(task="t", hazard={}, inferred_names=said), held_out=HeldOut(1, 1))
+    lines = summary(card)
+    assert "Logs tell what these entries are, which nobody named: own.vx (obs3)." in lines
+    assert any(line.endswith("than given: own.x (s), other0.dv (truck0_speed less speed).") for line in lines)

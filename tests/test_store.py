@@ -495,6 +495,10 @@ def test_entries_that_vary_for_one_agent_alone_are_no_constants(small_store):
     silent = [w for w in constant(small_store)]
     warning = constant(large)[0]
     assert " 2," in warning and " 1," not in warning and (not silent or " 1," not in silent[0])
+    kinds = small_store.observations.copy()
+    kinds[:, :, 1] = np.arange(kinds.shape[1])
+    apart = constant(dataclasses.replace(small_store, observations=kinds))[-1]
+    assert " 1 never vary but from agent to agent" in apart
 
 
 def test_content_tells_steps_apart(small_store):

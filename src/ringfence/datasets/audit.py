@@ -165,14 +165,17 @@ def odd_costs(store: EpisodeStore) -> list[str]:
 
 
 def _odd_observations(store: EpisodeStore) -> list[str]:
-    """Entries that never vary."""
+    """Entries that never vary, or from agent to agent alone."""
     warnings = []
     some = store.observations[:: max(1, len(store.observations) // 100_000)]
     constant = np.flatnonzero(np.ptp(some, axis=0).max(0) < 1e-9)  # for no agent
     if len(constant):
         names = store.card.observation_names
-        which = ", ".join(f"{d} ({names[d]})" if names else str(d) for d in constant)
-        warnings.append(f"Observation entries {which} never vary; views leave them out.")
+        apart = np.ptp(some, axis=(0, 1))[constant] >= 1e-9
+        for entries, how in ((constant[~apart], "never vary"), (constant[apart], "never vary but from agent to agent")):
+            which = ", ".join(f"{d} ({names[d]})" if names else str(d) for d in entries)
+            if which:
+                warnings.append(f"Observation entries {which} {how}; views leave them out.")
     return warnings
 
 

@@ -18,6 +18,11 @@ _MOTION = re.compile(rf"(d?v?)([{SPACE}{LANE}])")
 
 Role = Literal["place", "velocity", "offset", "drift", "number"]  # drift: a velocity less one's own
 _ROLES: dict[str, Role] = {"": "place", "v": "velocity", "d": "offset", "dv": "drift"}
+# names that do not say whose an entry is, e.g. robot0_dvx
+_LOOSE = re.compile(
+    rf"(?:.*?(?<![a-z]))??(d|delta[._ ]?|rel[._ ]?)?(?:(v|vel|velocity|speed)|p|pos|position)?[._ ]?([{SPACE}])"
+)
+_NUMBERS = re.compile(rf"(?:.*(?<![a-z]))?d?(?:cos|sin|{'|'.join((*HEADINGS, *SPEEDS))})")
 
 
 class Entry(NamedTuple):
@@ -29,6 +34,14 @@ class Entry(NamedTuple):
     role: Role
     axis: str  # one of SPACE or LANE; "" of a number
     source: int  # which entry it is
+
+
+def loosely(name: str) -> tuple[Role | None, str]:
+    """What a name may mean that does not say whose its entry is, and along which axis: a drift along x of `robot0_dvx`,
+    a number of `cos` and `truck0_speed`; None where it says nothing."""
+    if match := _LOOSE.fullmatch(name.lower()):
+        return _ROLES["d" * bool(match[1]) + "v" * bool(match[2])], match[3]
+    return ("number" if _NUMBERS.fullmatch(name.lower()) else None), ""
 
 
 def axes_of(fields: Collection[str], pattern: str = "d{}") -> str:

@@ -3,7 +3,8 @@
 What an agent sees of another is, number for number, that other's own entry less its own; and what two see of each other
 is the same with the opposite sign. Nothing else in logs is so exact, so such entries may be named as if somebody had:
 `other0.dx` of agent 0 is minus `other0.dx` of agent 1. Their velocities, one's own place, what stands still, what else
-moves and where a body heads for follow.
+moves and where a body heads for follow. Names that were given and may mean something (`truck0_dx`) decide what numbers
+leave open: which of several such entries are places.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.problem import partners
-from ringfence.problem.entries import SPACE, Entries
+from ringfence.problem.entries import SPACE, Entries, Role, loosely
 from ringfence.problem.partners import EXACT
 
 ROWS = 2000  # that are compared
@@ -25,6 +26,7 @@ FEWEST = 50  # below which nothing is said
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
 LESS = 0.5  # of a change that is left of that of a velocity relative to one's own, once one's own is added
+CALLED = 0.5  # of a change: what names call a velocity is off by less
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
 MEANING = ("own", "other", "agent", "obs", "state")  # words that name something else, or nothing
 
@@ -54,15 +56,16 @@ def inferred_names(
     if steps is None:
         return tuple(names)
     fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)]) or _listed(steps)
-    places = [f for f in fields if not any(f is other.speed for other in fields)]
-    moving = [f for f in places if f.speed is not None] or places
-    if len(moving) > len(SPACE):
+    moving = _along_axes(steps, fields, names)
+    if moving is None:
         return tuple(names)
     found: dict[int, str] = {}
-    for axis, place in zip(SPACE, moving):
+    for axis, place in moving.items():
         found |= _of_axis(steps, place, axis)
     found |= dict(_still(steps, moving, set(found)))
-    found |= _heading(steps, found)
+    found |= _heading(steps, found, Entries.of([f"own.{name}" for name in names]).direction)
+    found |= dict(_differences(fields, found))
+    found |= dict(_numbers(steps, found, names))
     found |= dict(_things(steps, found))
     found |= _as_given(found, names)
     return tuple(name if name in keep else found.get(entry, name) for entry, name in enumerate(names))
@@ -182,6 +185,75 @@ def _with_speeds(steps: Steps, fields: list[_Field], where: np.ndarray | None = 
     return fields
 
 
+def _along_axes(steps: Steps, fields: Sequence[_Field], names: Sequence[str]) -> dict[str, _Field] | None:
+    """The fields that are places, by axis: those that names call so; of those that they call nothing, what changes as
+    another one says, or all. None where there are too many."""
+    called = [(f, *_called(f, names)) for f in fields if not any(f is other.speed for other in fields)]
+    along: dict[str, _Field] = {}
+    for f, role, axis in called:
+        if role in ("place", "offset"):
+            along.setdefault(axis, f)
+    for f, role, axis in called:
+        place = along.get(axis)
+        if role in ("velocity", "drift") and place is not None and place.speed is None:
+            if unlike(steps, place.entries, f.entries) <= CALLED:
+                place.speed = f
+    left = [f for f, role, _ in called if role is None]
+    left = [f for f in left if f.speed is not None] or ([] if along else left)
+    if along and len(along) + len(left) > len(SPACE):
+        left = []
+    axes = sorted(along)
+    if axes != list(SPACE[: len(axes)]):  # a plane is one of x and y, whatever names it has
+        along = dict(zip(SPACE, (along[axis] for axis in axes)))
+    along |= zip([axis for axis in SPACE if axis not in along], left)
+    return along if len(left) <= len(SPACE) else None
+
+
+def _called(found: _Field, names: Sequence[str]) -> tuple[Role | None, str]:
+    """What names call it, where they agree."""
+    said = {loosely(names[entry]) for entry in found.entries}
+    if len(said) > 1:
+        return None, ""
+    role, axis = said.pop()
+    mine, its = (None, "") if found.own is None else loosely(names[found.own])
+    moves = ("velocity", "drift")
+    if mine is not None and (its != axis or (mine in moves) != (role in moves)):
+        return None, ""
+    return role, axis
+
+
+def _differences(fields: Sequence[_Field], found: Mapping[int, str]) -> Iterator[tuple[int, str]]:
+    """Entries that are what others have less what one has oneself, where that has a name: `other0.dcos`."""
+    for f in fields:
+        name = "" if f.own is None else found.get(f.own, "")
+        if name.startswith("own.") and not any(entry in found for entry in f.entries):
+            yield from ((entry, f"other{k}.d{name[4:]}") for k, entry in enumerate(f.entries))
+
+
+def _numbers(steps: Steps, found: Mapping[int, str], names: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """What names call alike of oneself and of each of the others who are known, e.g. `load` and `truck0_load`, where it
+    is what these have themselves."""
+    x = steps.before
+    if "other0.dx" not in found.values():
+        return
+    called: dict[tuple[str, str], dict[int, int]] = {}
+    for entry, name in enumerate(names):
+        if entry not in found and (match := re.fullmatch(r"(\w*?[A-Za-z])_?(\d{1,9})[._](\w*[A-Za-z])", name)):
+            called.setdefault((match[1], match[3]), {})[int(match[2])] = entry
+    for (_, what), each in called.items():
+        entries = [each[k] for k in sorted(each)]
+        own = names.index(what) if what in names else None
+        if own is None or own in found or len(entries) != x.shape[1] - 1:
+            continue
+        if all(steps.equal(x[:, i, entries[j - (j > i)]], x[:, j, own], own) for i, j in _both_ways(x.shape[1])):
+            yield own, f"own.{what}"
+            yield from ((entry, f"other{k}.{what}") for k, entry in enumerate(entries))
+
+
+def _both_ways(agents: int) -> Iterator[tuple[int, int]]:
+    return ((i, j) for i in range(agents) for j in range(agents) if i != j)
+
+
 def _of_axis(steps: Steps, place: _Field, axis: str) -> dict[int, str]:
     """Names, by entry, of the places and speeds of others and of oneself along an axis."""
     own_speed = place.speed.own if place.speed else _own_speed(steps, place)
@@ -222,34 +294,59 @@ def _off(steps: Steps, change: np.ndarray, speeds: Sequence[int], where: np.ndar
     return min(found)
 
 
-def _still(steps: Steps, places: Sequence[_Field], named: set[int]) -> Iterator[tuple[int, str]]:
+def _still(steps: Steps, places: Mapping[str, _Field], named: set[int]) -> Iterator[tuple[int, str]]:
     """Entries that change as one's own place does, with the opposite sign: where things are that stand still."""
     found = []
-    for place in places:
+    for place in places.values():
         if place.own is None:
             return
         moved = steps.change([place.own])[..., 0].ravel()
         free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
         found.append([e for e in free if steps.equal(steps.change([e])[..., 0].ravel(), -moved, place.own)])
     for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*found)):
-        for axis, entry in zip(SPACE, entries):
+        for axis, entry in zip(places, entries):
             yield entry, f"still_{letter}.d{axis}"
 
 
-def _heading(steps: Steps, found: Mapping[int, str]) -> dict[int, str]:
+def _heading(steps: Steps, found: Mapping[int, str], called: Sequence[int]) -> dict[int, str]:
     """Names of a direction in which a body moves that has one, as two entries or an angle: its velocity is along it, or
-    the change of its place; in that case of its speed, too."""
+    the change of its place; in that case of its speed, too. What names have `called` so may also go backwards."""
     at = {name: entry for entry, name in found.items()}
     if {"own.vx", "own.vy"} <= set(at):
         velocity = steps.before[..., [at["own.vx"], at["own.vy"]]].reshape(-1, 2)
-        return _direction(steps, steps.before, velocity, found)
+        return _direction(steps, steps.before, velocity, found) or _either_way(steps, steps.before, velocity, called)
     if not {"own.x", "own.y"} <= set(at):
         return {}
     moved = steps.change([at["own.x"], at["own.y"]]).reshape(-1, 2)
     for rows in (steps.after, steps.before):
         if direction := _direction(steps, rows, moved, found):
-            return direction | _speed_ahead(steps, moved, {*found, *direction})
+            length = np.linalg.norm(moved, axis=-1)
+            return direction | _speed_ahead(steps, length, {*found, *direction})
+    for rows in (steps.after, steps.before):
+        if direction := _either_way(steps, rows, moved, called):
+            ahead = (moved * _looks(rows, called)).sum(-1)
+            return direction | _speed_ahead(steps, ahead, {*found, *direction})
     return {}
+
+
+def _looks(rows: np.ndarray, entries: Sequence[int]) -> np.ndarray:
+    """(W N, 2) the direction of these entries of `rows` (W, N, O): its cosine and sine, or an angle."""
+    told = rows[..., list(entries)].reshape(-1, len(entries))
+    return told if len(entries) == 2 else np.concatenate([np.cos(told), np.sin(told)], -1)
+
+
+def _either_way(steps: Steps, rows: np.ndarray, velocity: np.ndarray, called: Sequence[int]) -> dict[int, str]:
+    """Names of what is called a direction, where velocities (W N, 2) are along it, forwards or backwards."""
+    speed = np.linalg.norm(velocity, axis=-1)
+    moves = speed > np.median(speed)
+    if not called or not moves.any() or not all(steps.varies(entry) for entry in called):
+        return {}
+    looks = _looks(rows, called)
+    unit = np.abs(np.linalg.norm(looks, axis=-1) - 1.0) <= EXACT
+    along = np.abs((velocity * looks).sum(-1))[moves] >= (1 - LIKE) * speed[moves]
+    if unit.mean() < SHARE or along.mean() < SHARE:
+        return {}
+    return dict(zip(called, ("own.cos", "own.sin") if len(called) == 2 else ("own.heading",)))
 
 
 def _direction(steps: Steps, rows: np.ndarray, velocity: np.ndarray, found: Mapping[int, str]) -> dict[int, str]:
@@ -288,10 +385,9 @@ def _of_unit_length(rows: np.ndarray, entries: Sequence[int]) -> Iterator[tuple[
 
 
 def _speed_ahead(steps: Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:
-    """The name of the entry that says how far bodies with a direction move (W N, 2) in a step, where there is one."""
-    length = np.linalg.norm(moved, axis=-1)
+    """The name of the entry that says how far bodies with a direction move (W N,) in a step, where there is one."""
     free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
-    off = {e: _off(steps, length, [e]) for e in free}
+    off = {e: _off(steps, moved, [e]) for e in free}
     best = min(off, key=off.__getitem__, default=None)
     return {} if best is None or off[best] > LIKE else {best: "own.v"}
 

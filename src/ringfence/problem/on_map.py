@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ringfence.problem.entries import SPACE, Entries
+from ringfence.problem.entries import SPACE, Entries, loosely
 from ringfence.problem.inferred_names import EXACT, LIKE, SHARE, Steps, inferred_names, unlike
 
 FIRST = 8  # of the rows that are compared, by which most entries are told apart
@@ -134,7 +134,8 @@ def relative(
         columns = columns.with_others(_of_state(steps, seen, names, joined, keep))
         found = called(columns)
     own = _own_axes(steps, free, found)
-    of_things = _of_things(steps, [d for d in free if d not in of_others], names, own)
+    left = [d for d in free if d not in of_others and found[d] == names[d]]
+    of_things = _of_things(steps, left, names, own)
     if of_things:
         columns = columns.less(of_things)
         found = _with_things(called(columns), names, of_things, own)
@@ -238,10 +239,11 @@ def _of_things(steps: _Steps, free: Sequence[int], names: Sequence[str], own: di
 
 
 def _things(free: Sequence[int], names: Sequence[str], own: dict[str, int]) -> dict[str, dict[tuple[bool, str], int]]:
-    """Entries of each thing that names tell of, by whether they are velocities and by axis."""
+    """Entries of each thing that names tell of, by whether they are velocities and by axis, but for what they call
+    relative to oneself."""
     found: dict[str, dict[tuple[bool, str], int]] = {}
     for d in free:
-        match = AXIS.fullmatch(names[d].lower())
+        match = None if loosely(names[d])[0] in ("offset", "drift") else AXIS.fullmatch(names[d].lower())
         if match and d not in own.values() and (thing := match[1].strip("._")):
             found.setdefault(thing, {})[match[2] in SPEEDS, match[3]] = d
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -19,6 +20,8 @@ JUDGED = 3  # steps ahead that the margin is calibrated for
 NO_ERROR = 0.01  # of the deviation of what is predicted: less is exact enough
 WIDENED = (5, 10, 15)  # rows ahead of which its words say what they ask for
 LITTLE = 0.05  # margins, of which they say nothing
+PUT = ", put into held-out states"  # what names of answers about somebody end with
+UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
 SHOWN = 3  # things that a barrier reads, beside distances, whose prediction its words show
 NO_CLIMB = ": guards that climb them (refine, full) are refused"
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
@@ -43,7 +46,8 @@ class Data(Part, frozen=True):
     observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
     state_origins: list[float] | None = None
     ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
-    inferred_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/inferred_names.py)
+    # of entries that nobody named, or that are read by another name, by the one they have (problem/inferred_names.py)
+    inferred_names: dict[str, str] | None = None
     impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
     action_delay: int = 0  # steps that commands took to take effect: a guard decides for so much later (logs/late.py)
     late: tuple[int | None, ...] = ()  # steps after which commands of each agent take effect, where not at once
@@ -144,13 +148,14 @@ class Verdict(Part, frozen=True):
     """Whether a World is fit to guard by."""
 
     word: Literal["fit", "weak", "unfit"]
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()  # what is amiss, or the numbers that carried it
     remedies: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         if not self.reasons:
             return self.word
-        return plain(f"{self.word}: {'; '.join(self.reasons)}; {' or '.join(self.remedies)}")
+        remedies = f"; {' or '.join(self.remedies)}" if self.remedies else ""
+        return plain(f"{self.word}: {'; '.join(self.reasons)}{remedies}")
 
 
 class BarrierScores(Part, frozen=True):
@@ -271,9 +276,11 @@ def _of_data(card: Card) -> Iterator[str]:
         yield line + "judged on none."
         return
     yield f"{line}judged on {held_out.episodes} that nothing was fitted to ({held_out.steps} steps)."
-    if inferred := card.data.inferred_names:
-        named = ", ".join(f"{name} ({entry})" for entry, name in inferred.items())
-        yield f"Logs tell what these entries are, where nobody named them or they are places on a map: {named}."
+    inferred = card.data.inferred_names or {}
+    if named := [f"{name} ({entry})" for entry, name in inferred.items() if UNNAMED.match(entry)]:
+        yield f"Logs tell what these entries are, which nobody named: {', '.join(named)}."
+    if read := [f"{name} ({entry})" for entry, name in inferred.items() if not UNNAMED.match(entry)]:
+        yield f"Logs tell what these entries are, which are read by other names than given: {', '.join(read)}."
     if card.data.partners:
         yield "Who is in lists of the nearest is found by what two see of each other; predictions read what these do."
     if card.data.impacts:
@@ -306,7 +313,8 @@ def _of_prediction(card: Card) -> Iterator[str]:
 
 def _of_foresight(read: tuple[Foresight, ...]) -> Iterator[str]:
     """What a barrier reads, in its own unit: distances, and of the rest what constant velocity tells nearly as well."""
-    order = sorted(read, key=lambda one: one.coasting[-1] / max(one.error[-1], 1e-9))
+    changing = [one for one in read if one.error[-1] or one.coasting[-1]]
+    order = sorted(changing, key=lambda one: one.coasting[-1] / max(one.error[-1], 1e-9))
     shown = [one for one in order if one.name.startswith("length of ")]
     shown += [one for one in order if one not in shown][:SHOWN]
     for one in shown:

@@ -101,7 +101,7 @@ class Dynamics(eqx.Module):
     mean: Array  # (D,)
     scale: Array  # (D,)
     step_mean: Array  # (F,) of the predicted entries
-    step_scale: Array  # (F,)
+    step_scale: Array  # (F,) 0 of entries that never change within an episode
     map: FeatureMap = eqx.field(static=True)
     # Bodies that look ahead go no slower than that, e.g. backwards: nobody brakes at rest in logs of cars, so networks
     # do not learn that they stay where they are.
@@ -230,7 +230,22 @@ def fit_dynamics(
     data = features, actions, row, *(partners.seen_in(map.mirrored, features, model.scale) if map.mirrored else ())
     label = "forward dynamics, what actions do"
     updates = settings.dynamics_updates
-    return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * members, 4e-3, label))
+    fit = model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * members, 4e-3, label))
+    return _left_alone(fit, before, after, states, np.asarray(row))
+
+
+def _left_alone(
+    model: Dynamics, before: np.ndarray, after: np.ndarray, states: np.ndarray, row: np.ndarray
+) -> Dynamics:
+    """The model that leaves entries alone which never change in a step from rows (T,) of states (M, N or 1, D), e.g.
+    how long a body is; some steps, from `before` to `after` (S, D), tell most others."""
+    likely = model.predicted[(before == after).all(0)[model.predicted]]
+    still = [d for d in likely.tolist() if np.array_equal(states[row, :, d], states[row + 1, :, d])]
+    if not still:
+        return model
+    zero = np.isin(model.predicted, still)
+    each = lambda d: (d.step_mean, d.step_scale)  # noqa: E731
+    return eqx.tree_at(each, model, tuple(jnp.where(zero, 0.0, x) for x in each(model)))
 
 
 def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dynamics:

@@ -12,7 +12,7 @@ from ringfence.problem.entries import Entries
 from ringfence.types import Array
 from ringfence.world import cause_candidates, cause_counts
 from ringfence.world.barrier import Barrier, MinBarrier
-from ringfence.world.card import UNKNOWN, Probe, ProbeMap
+from ringfence.world.card import PUT, UNKNOWN, Probe, ProbeMap
 from ringfence.world.cause_nets import Score
 from ringfence.world.causes import Cause, Edge
 from ringfence.world.logged import Logged
@@ -61,7 +61,7 @@ def _neighbour(cause: Cause, radius: float, scores: list[np.ndarray]) -> Probe:
     """What is answered about something at each of RADII, by scores (speeds, W) of states."""
     at_rest, *closing = ([round(float((one[k] < 0).mean()), 3) for one in scores] for k in range(len(scores[0])))
     return Probe(
-        name=f"{cause.name}, put into held-out states",
+        name=cause.name + PUT,
         at=tuple(round(ratio * radius, 4) for ratio in RADII),
         scores=tuple(round(float(np.median(one)), 3) for one in scores),
         edge=radius,

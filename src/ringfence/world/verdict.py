@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 from msgspec.structs import replace
 
 from ringfence.errors import UserError
 from ringfence.logs.late import Lateness
-from ringfence.world.card import FARTHEST, JUDGED, Avoidable, BarrierScores, Card, Look, Verdict
+from ringfence.world.card import FARTHEST, JUDGED, PUT, Avoidable, BarrierScores, Card, Look, Verdict
 from ringfence.world.causes import Found
 
 Word = Literal["fit", "weak", "unfit"]
@@ -58,8 +58,27 @@ def judge(card: Card) -> Verdict:
     for word in ("weak", "unfit"):
         if any(given == word for given, _, _ in found):
             worst = word
-    shown = [(reason, remedy) for given, reason, remedy in found if given == worst] if worst != "fit" else []
-    return Verdict(worst, tuple(r for r, _ in shown), tuple(dict.fromkeys(m for _, m in shown)))
+    if worst == "fit":
+        return Verdict(worst, tuple(_carried(list(scores.values()))))
+    shown = [(reason, remedy) for given, reason, remedy in found if given == worst]
+    return Verdict(worst, tuple(r for r, _ in shown), _each_once([m for _, m in shown]))
+
+
+def _each_once(remedies: Sequence[str]) -> tuple[str, ...]:
+    """Without those that another says, too."""
+    return tuple(one for one in dict.fromkeys(remedies) if not any(one != more and one in more for more in remedies))
+
+
+def _carried(scores: Sequence[BarrierScores]) -> Iterator[str]:
+    """The numbers that carried a World that is fit, the least of its constraints."""
+    found = (
+        ("{:.1%} of unsafe steps are found", [one.recall for one in scores]),
+        ("{:.1%} of safe steps keep the margin", [one.margin_kept for one in scores]),
+        ("{:.1%} of entries into danger are predicted", [1 - one.miscoverage for one in scores]),
+    )
+    for words, values in found:
+        if known := [value for value in values if not math.isnan(value)]:
+            yield words.format(min(known))
 
 
 def _barrier(scores: BarrierScores, of: str, untold: str) -> Iterator[tuple[Word, str, str]]:
@@ -78,12 +97,23 @@ def _barrier(scores: BarrierScores, of: str, untold: str) -> Iterator[tuple[Word
             "log what decides where danger begins, or more episodes",
         ),
         (_avoided(scores), AVOIDABLE, "{:.0%} of danger can be avoided", "log stronger braking and turning"),
-        (scores.probed, PROBED, "{:.1%} of states inside the radius are called unsafe", "give a formula of danger"),
+        (
+            scores.probed,
+            PROBED,
+            f"{{:.1%}} of states with something put nearer than {_radius(scores)} are called unsafe",
+            "give a formula of danger",
+        ),
     )
     for value, limits, words, remedy in checks:
         word = _word(value, limits)
         if word != "fit":
             yield word, f"only {words.format(value)}{of}", remedy
+
+
+def _radius(scores: BarrierScores) -> str:
+    """The distances inside of which things were put, as the logs tell where danger begins."""
+    put = [f"{one.edge:.3g} ({one.name.removesuffix(PUT)})" for one in scores.probes if one.unsafe]
+    return " and ".join(put) or "danger begins"
 
 
 def _told(causes: Found, recall: float, of: str) -> Iterator[tuple[Word, str, str]]:
