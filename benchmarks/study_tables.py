@@ -13,6 +13,7 @@ import numpy as np
 import pooled
 import public_sets
 from common import markdown, of_json, read
+from families import FAMILIES
 from scipy.stats import spearmanr
 from stress import FAULTS, KNOWN, RATES, in_words, name_of, trials
 from systems import MAPPED, SHAPED, Kind
@@ -52,6 +53,30 @@ def shapes(file: str, kinds: Sequence[Kind], whole: str, less: str) -> str:
             if all(each):
                 lines.append((f"{name} {seed}", driver, *map(_short, each)))
     return markdown(("logs", "who acts", "no guard", f"shield, {less}", "shield"), lines)
+
+
+def families() -> str:
+    """A row per system: what was found, and the percentage of episodes with a violation, of the naive driver and of the
+    clone, alone and under the shield; under that of a World without rules where this was played."""
+    rows = {(r["system"], r["causes"], r["driver"], r["guard"]): r for r in read("families.csv")}
+    lines = []
+    for family in FAMILIES:
+        for kind in (*family.open, *family.kept):
+            alone, ruled, plain = (
+                [rows.get((kind.name, causes, driver, guard)) for driver in ("naive", "clone")]
+                for causes, guard in (("rules", "none"), ("rules", "shield"), ("no rules", "shield"))
+            )
+            if not all((*alone, *ruled)):
+                continue
+            kept = ", kept" if kind in family.kept else ""
+            shares = [f"{percent(a['violated'])}, {percent(b['violated'])}" for a, b in zip(alone, ruled)]
+            before = "–"
+            if all(plain):
+                before = f"*{plain[0]['verdict']}*: {', '.join(percent(r['violated']) for r in plain)}"
+            found = re.sub(" of agent .*", " of some", ruled[0]["found"])
+            lines.append((f"`{kind.name}`{kept}", kind.says, f"*{ruled[0]['verdict']}*", found, *shares, before))
+    head = ("system", "what is dangerous", "verdict", "what was found", "naive, shield", "clone, shield", "no rules")
+    return markdown(head, lines)
 
 
 def _short(r: dict[str, str]) -> str:
@@ -377,6 +402,8 @@ PROVING, STRESS, GUARDS = "docs/proving-ground.md", "docs/stress-results.md", "d
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     (PROVING, "shaped"): lambda: said(SHAPED),
     (PROVING, "shapes"): lambda: shapes("shapes.csv", SHAPED, "more shapes", "no more shapes"),
+    (PROVING, "ruled"): lambda: shapes("shapes.csv", SHAPED, "rules", "more shapes"),
+    (PROVING, "families"): families,
     (PROVING, "mapped"): lambda: said(MAPPED),
     (PROVING, "on-map"): lambda: shapes("on_map.csv", MAPPED, "how far away", "places as they are"),
     (PROVING, "trackers"): trackers,

@@ -683,7 +683,7 @@ def test_verdicts_give_their_reasons():
         causes = {"": Found((of_cause,), told)}
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, recall=recall), causes=causes))
         assert found.word == word and (word == "fit" or f"tell only {told:.1%} of the danger" in found.reasons[0])
-        assert word == "fit" or "a sum or an area over the team" in found.remedies[0]
+        assert word == "fit" or "give a formula of danger" in found.remedies[0]
     for names, remedy in (
         (("obs0", "obs1"), "name the entries that tell danger, or log them"),
         (("own.x", "own.y"), "log what tells danger, if it is not among the entries, or give a formula"),

@@ -49,9 +49,8 @@ def test_lanes_are_read_as_planes_are():
     reads = (
         lambda m: derived(m.names, 3),
         lambda m: others_offsets(m.names).tolist(),
-        lambda m: [(c.things, c.also, c.how) for c in cause_candidates.with_distances(m.names)],
-        lambda m: [c.things for c in cause_candidates.offsets(m.names)],
-        lambda m: [(c.things, c.also) for c in cause_candidates.with_vectors(m.names)],
+        lambda m: [(c.width, c.entries()) for c in cause_candidates.pairs(m.names)],
+        lambda m: [c.entries() for c in cause_candidates.offsets(m.names)],
         lambda m: _going(list(m.names)),
         lambda m: constant_velocity(m, 0.1).follows,
         lambda m: Names.of(m.names, (), 3).slots,
@@ -70,8 +69,8 @@ def test_lanes_are_read_as_planes_are():
 @pytest.mark.parametrize("looks", [("cos", "sin"), ("cos_yaw", "sin_yaw"), ("psi",), ("heading",)])
 def test_who_looks_into_a_direction_sees_things_ahead_and_aside(looks):
     names = named("sd" if looks == ("psi",) else "xy", *looks)
-    (turned,) = (c for c in cause_candidates.with_distances(names) if c.how == "turned")
-    assert turned.also == (tuple(4 + k for k in range(len(looks))),) * 2
+    (turned,) = (c for c in cause_candidates.pairs(names) if c.name == "other.ahead, other.aside")
+    assert [entry.at for entry in turned.reads[0].direction] == [(4 + k,) for k in range(len(looks))]
     heading = Heading.of(names)
     assert (heading is None) == (len(looks) == 1)
     if heading is not None:

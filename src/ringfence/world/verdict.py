@@ -29,7 +29,7 @@ UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
 LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V sees in time what they do not
 BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
-FORMULA = "give a formula of danger (hazard), e.g. where it is a sum or an area over the team"
+FORMULA = "give a formula of danger (hazard)"
 
 
 def decided(card: Card) -> Card:
