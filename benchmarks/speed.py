@@ -49,6 +49,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
 from ringfence.training.job import make_job
 from ringfence.training.runs import Run
+from ringfence.world import cause_search
 
 
 def main() -> None:
@@ -231,6 +232,39 @@ def collect(rows: Rows, brief: bool) -> None:
     units = ("s", "s", "MiB", "MiB", "return per episode")
     for name, unit, value in zip(names, units, in_a_process(COLLECT, "20000" if brief else "1000000")):
         rows(f"collect medium, 1 M transitions: {name}", value, unit)
+
+
+def causes(rows: Rows, brief: bool) -> None:
+    """The search for causes in 200,000 steps of six walkers: of two who are too near, of who is near and fast, and of a
+    sum over the team."""
+    rng = np.random.default_rng(0)
+    episodes, agents = (50 if brief else 2000), 6
+    velocity = np.cumsum(rng.normal(0, 0.2, (episodes, 100, agents, 2)), 1) + rng.normal(
+        0, 0.5, (episodes, 1, agents, 2)
+    )
+    place = np.cumsum(0.1 * velocity, 1) + rng.uniform(-6, 6, (episodes, 1, agents, 2))
+    others = np.array([[j for j in range(agents) if j != i] for i in range(agents)])
+    offset, relative = (a[:, :, others] - a[:, :, :, None] for a in (place, velocity))
+    moves = np.concatenate([offset, relative], -1).reshape(episodes, 100, agents, -1)
+    load = np.cumsum(rng.normal(0, 0.1, (episodes, 100, agents, 1)), 1)
+    x = np.concatenate([place, velocity, load, moves], -1).astype(np.float32).reshape(episodes * 100, agents, -1)
+    names = ["own.x", "own.y", "own.vx", "own.vy", "own.load"]
+    names += [f"other{j}.{what}" for j in range(agents - 1) for what in ("dx", "dy", "dvx", "dvy")]
+    near = np.linalg.norm(offset, axis=-1).min(-1)
+    fast = np.linalg.norm(velocity, axis=-1)
+    dangers = {
+        "two too near": (near < 0.25).any(-1),
+        "near and fast": ((near < 0.5) & (fast > 2.0)).any(-1),
+        "sum over the team": np.abs(load[..., 0].sum(-1)) > 3.5,
+    }
+    for name, unsafe in dangers.items():
+        begun = time.process_time()
+        found, _ = cause_search.find(x, unsafe.reshape(-1), np.arange(len(x)) // 100, names)
+        rows(
+            f"search, {name}: {'; '.join(cause.name for cause in found.causes)}",
+            time.process_time() - begun,
+            "s of CPU",
+        )
 
 
 def actor_critic(rows: Rows, brief: bool) -> None:
@@ -452,6 +486,7 @@ GROUPS: dict[str, Callable[[Rows, bool], None]] = {
     "guard": guard,
     "crossing": crossing,
     "startup": startup,
+    "causes": causes,
 }
 
 if __name__ == "__main__":
