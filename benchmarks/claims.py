@@ -325,6 +325,7 @@ def of_rebounds() -> tuple[bool, str]:
 
 
 MORE, LESS = "more shapes", "no more shapes"
+FAMILIES = ""
 
 
 @on("shapes.csv")
@@ -349,6 +350,18 @@ def of_rays() -> tuple[bool, str]:
     earned = {which: [float(r["return"]) for r in each] for which, each in both.items()}
     holds = {r["verdict"] for r in both[MORE]} == {"fit"} and min(bad[MORE]) > 20 and max(bad[LESS]) <= 10
     return holds and max(earned[LESS]) < 0 < min(earned[MORE]), f"violated {bad}, return {earned}"
+
+
+@on("families.csv")
+def of_families() -> tuple[bool, str]:
+    """Verdicts, and episodes of 60 with a violation under the shield, of what was played of nine families."""
+    rows = {(r["system"], r["driver"]): r for r in rows_of("families.csv", guard="shield", causes="rules")}
+    names = sorted({name for name, _ in rows})
+    fit = [name for name in names if rows[name, "clone"]["verdict"] == "fit"]
+    left = {driver: [violated(rows[name, driver])[0] for name in fit] for driver in ("clone", "naive")}
+    few = {driver: sum(bad <= 2 for bad in each) for driver, each in left.items()}
+    told = f"{len(fit)} of {len(names)} fit; {few}, at most {max(left['clone'])} and {max(left['naive'])} of 60"
+    return told == FAMILIES, told
 
 
 @on("on_map.csv")

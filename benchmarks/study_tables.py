@@ -73,7 +73,7 @@ def families() -> str:
             before = "–"
             if all(plain):
                 before = f"*{plain[0]['verdict']}*: {', '.join(percent(r['violated']) for r in plain)}"
-            found = re.sub(" of agent .*", " of some", ruled[0]["found"])
+            found = re.sub(" of agent .*", " of some", ruled[0]["found"]).replace("|", r"\|")
             lines.append((f"`{kind.name}`{kept}", kind.says, f"*{ruled[0]['verdict']}*", found, *shares, before))
     head = ("system", "what is dangerous", "verdict", "what was found", "naive, shield", "clone, shield", "no rules")
     return markdown(head, lines)
