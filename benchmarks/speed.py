@@ -239,10 +239,10 @@ def causes(rows: Rows, brief: bool) -> None:
     sum over the team."""
     rng = np.random.default_rng(0)
     episodes, agents = (50 if brief else 2000), 6
-    velocity = np.cumsum(rng.normal(0, 0.2, (episodes, 100, agents, 2)), 1) + rng.normal(
-        0, 0.5, (episodes, 1, agents, 2)
-    )
-    place = np.cumsum(0.1 * velocity, 1) + rng.uniform(-6, 6, (episodes, 1, agents, 2))
+    phase = rng.uniform(0, 2 * np.pi, (episodes, 1, agents, 2))
+    turning = rng.uniform(0.02, 0.06, phase.shape)  # rad a step
+    phase = phase + turning * np.arange(100)[:, None, None]
+    place, velocity = 6 * np.sin(phase), 60 * turning * np.cos(phase)  # m, m/s
     others = np.array([[j for j in range(agents) if j != i] for i in range(agents)])
     offset, relative = (a[:, :, others] - a[:, :, :, None] for a in (place, velocity))
     moves = np.concatenate([offset, relative], -1).reshape(episodes, 100, agents, -1)

@@ -165,10 +165,8 @@ def _is_of_several(steps: Steps, cause: Cause) -> bool:
 
 
 def _tell_enough(steps: Steps, chosen: list[Counted]) -> bool:
-    """Whether causes tell nearly all unsafe steps, and nearly all safe ones."""
-    called = [_by_other_parts(steps, one, _without(steps, chosen, one)) for one in chosen]
-    told = _summary(steps, chosen, called) if chosen else Found(false_alarms=1.0)
-    return min(told.explained, 1.0 - told.false_alarms) > ENOUGH
+    """Whether causes tell nearly all unsafe steps, and call hardly any others unsafe, as few as they may miss."""
+    return _wrong_together(steps, chosen) < (1 - ENOUGH) * steps.unsafe.sum()
 
 
 def _as_rule(steps: Steps, one: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
