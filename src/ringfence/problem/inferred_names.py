@@ -245,13 +245,10 @@ def _numbers(steps: Steps, found: Mapping[int, str], names: Sequence[str]) -> It
         own = names.index(what) if what in names else None
         if own is None or own in found or len(entries) != x.shape[1] - 1:
             continue
-        if all(steps.equal(x[:, i, entries[j - (j > i)]], x[:, j, own], own) for i, j in _both_ways(x.shape[1])):
+        seen = ((i, j) for pair in _pairs(x.shape[1]) for i, j in (pair, pair[::-1]))
+        if all(steps.equal(x[:, i, entries[j - (j > i)]], x[:, j, own], own) for i, j in seen):
             yield own, f"own.{what}"
             yield from ((entry, f"other{k}.{what}") for k, entry in enumerate(entries))
-
-
-def _both_ways(agents: int) -> Iterator[tuple[int, int]]:
-    return ((i, j) for i in range(agents) for j in range(agents) if i != j)
 
 
 def _of_axis(steps: Steps, place: _Field, axis: str) -> dict[int, str]:

@@ -297,7 +297,8 @@ def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edg
         near = np.abs(value - bound) < AROUND * size
         bad, fine = value[near & left], value[near & ~steps.unsafe]
         if not edge.unseen[k] and len(bad) and len(fine):
-            bounds[k] = _parting(bad, fine, low_is_bad=(k % 2 == 0) == edge.inside)
+            sign = 1.0 if (k % 2 == 0) == edge.inside else -1.0
+            bounds[k] = sign * parted(sign * bad, sign * fine)[1]
     seen = [bound for bound, unseen in zip(bounds, edge.unseen) if not unseen]
     at = None if edge.at is None else round(seen[0], 4)
     return msgspec.structs.replace(edge, bounds=tuple(sorted(bounds)), at=at)
@@ -321,19 +322,17 @@ def of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: np
     return found
 
 
-def told_wrong(bad: np.ndarray, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(values, how many of bad and fine ones, which are sorted, an edge at each tells wrongly where low is bad)."""
+def parted(bad: np.ndarray, fine: np.ndarray) -> tuple[int, float]:
+    """(steps told wrongly by the edge that tells fewest so, where it is), by scores of unsafe and of safe steps, low in
+    danger: in the middle to the next score; −∞ where no score is finite."""
+    bad, fine = np.sort(bad), np.sort(fine)
     tried = np.unique(np.concatenate([bad, fine]))
-    return tried, len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
-
-
-def _parting(bad: np.ndarray, fine: np.ndarray, low_is_bad: bool) -> float:
-    """The value that parts most unsafe steps from safe ones: in the middle of all that do as well."""
-    sign = 1.0 if low_is_bad else -1.0
-    tried, wrong = told_wrong(np.sort(sign * bad), np.sort(sign * fine))
-    best = int(wrong.argmin())
-    following = tried[best + 1] if best + 1 < len(tried) else tried[best]
-    return float(sign * 0.5 * (tried[best] + following))
+    wrong = len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
+    tried = tried[np.isfinite(tried)]  # what is not finite comes last
+    if not len(tried):
+        return len(bad), -np.inf
+    best = int(wrong[: len(tried)].argmin())
+    return int(wrong[best]), float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
 
 
 def within(steps: Steps, cause: Cause, edge: Edge) -> np.ndarray:

@@ -248,12 +248,6 @@ def goes_on(quantity: Quantity) -> bool:
     return isinstance(quantity, (Length, All)) or (isinstance(quantity, Sum) and len(quantity.parts) > 1)
 
 
-def below(quantity: Quantity, x: Between) -> tuple[Any, Any]:
-    """The least and the most that it is of all features between (..., N, D)."""
-    found = quantity.of(x)
-    return found.low, found.high
-
-
 def _thing_at(words: Sequence[str]) -> str:
     """What kind of thing is at an offset that is called so, e.g. other.dx and other.dy; "" where it is none."""
     found = [re.fullmatch(r"(.*)\.d(\w)", one) for one in words]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, told_wrong
+from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
 from ringfence.world.causes import Cause
 from ringfence.world.cells import VISITED, Cells
 from ringfence.world.quantities import All, Over, Quantity, Sum
@@ -36,12 +36,10 @@ class _Read:
     bad: np.ndarray  # (T,) or (T, N) bool: unsafe and not explained
     fine: np.ndarray
 
-    def wrong(self, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(values to part at, steps that each tells wrongly) of scores (T, P), low in danger."""
+    def parted(self, score: np.ndarray) -> tuple[int, float]:
+        """(steps that a score (T, P) tells wrongly, low in danger, where danger begins)."""
         worst = of_the_worst(self.steps, score, score, self.agents)
-        tried, wrong = told_wrong(np.sort(worst[self.bad]), np.sort(worst[self.fine]))
-        kept = np.isfinite(tried)
-        return tried[kept], wrong[kept]
+        return parted(worst[self.bad], worst[self.fine])
 
 
 @dataclass(frozen=True)
@@ -66,45 +64,42 @@ def rules_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause
     sides = _fitted(read, _box(one.cells, scale))
     units = scale[sides[0].number] / scale if sides else scale
     if len(sides) > 1:
-        yield replace_reads(cause, All(tuple(_condition(cause.reads, side, scale, units) for side in sides)))
+        yield _reading(cause, All(tuple(_condition(cause.reads, side, scale, units) for side in sides)))
     if cause.width == 2:
         line = _line(read, one.cells)
         if line is not None:
             sign, weight, at = line
             weights = sign[0], float(sign[1] * weight * scale[0] / scale[1])
-            yield replace_reads(cause, Sum(cause.reads, weights, -float(at * scale[0])))
+            yield _reading(cause, Sum(cause.reads, weights, -float(at * scale[0])))
 
 
-def replace_reads(cause: Cause, read: Quantity) -> Cause:
+def _reading(cause: Cause, read: Quantity) -> Cause:
     return Cause((read,), cause.who)
 
 
 def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Quantity]) -> Iterator[Cause]:
     """The cause with one of its thresholds a line of one or a few numbers more: those that tell most of the steps."""
     conditions = _conditions(one)
-    some, whole = _read(steps, one, explained, SCREENED)[0], None
-    best: tuple[float, int, np.ndarray] | None = None
+    some = _read(steps, one, explained, SCREENED)[0]
+    best: tuple[float, int, _Near, np.ndarray] | None = None
     for k in range(len(conditions) if more else 0):
         near = _Near.of(some, one.cause, conditions, k)
         if min(near.bad.sum(), near.fine.sum()) >= FEW:
-            loss, weights = near.likeliest(np.stack([near.of_quantity(each) for each in more], -1))
+            loss, weights = near.likeliest(more)
             if best is None or loss < best[0]:
-                best = loss, k, weights
+                best = loss, k, near, weights
     if best is None:
         return
-    _, k, weights = best
-    order = np.argsort(-np.abs(weights))
+    _, k, few, weights = best
     whole = _Near.of(_read(steps, one, explained)[0], one.cause, conditions, k)
+    order = np.argsort(-np.abs(weights))
     for count in range(1, min(MOST_TERMS, int((weights != 0).sum())) + 1):
         terms = [more[j] for j in order[:count]]
-        numbers = np.stack([whole.of_quantity(each) for each in terms], -1)
-        few = _Near.of(some, one.cause, conditions, k)
-        begun = few.likeliest(np.stack([few.of_quantity(each) for each in terms], -1), raw=True)[1]
-        found, at = whole.refined(numbers, begun)
+        found, at = whole.refined(terms, few.likeliest(terms, raw=True)[1])
         old = conditions[k]
         new = Sum((*old.parts, *terms), (*old.weights, *(float(w) for w in found)), float((old.more or 0.0) - at))
         parts = (*conditions[:k], new, *conditions[k + 1 :])
-        yield replace_reads(one.cause, parts[0] if len(parts) == 1 else All(parts))
+        yield _reading(one.cause, parts[0] if len(parts) == 1 else All(parts))
 
 
 def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause]:
@@ -121,7 +116,7 @@ def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Ca
 
     def wrong(weights: np.ndarray) -> int:
         score = sign * each @ weights
-        return int(told_wrong(np.sort(score[team]), np.sort(score[fine]))[1].min())
+        return parted(score[team], score[fine])[0]
 
     weights, least = np.ones(agents), wrong(np.ones(agents))
     for factors in ((0.0, *WEIGHTS), WEIGHTS, [w**0.25 for w in WEIGHTS], [w**0.0625 for w in WEIGHTS]):
@@ -133,7 +128,7 @@ def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Ca
     if not weights.any():
         return
     weights = weights / weights.max()
-    yield replace_reads(one.cause, Over(read.part, "team", weights=tuple(round(float(w), 4) for w in weights)))
+    yield _reading(one.cause, Over(read.part, "team", weights=tuple(round(float(w), 4) for w in weights)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,14 +154,17 @@ class _Near:
         bad, fine = read.bad.reshape(-1)[keys], read.fine.reshape(-1)[keys]
         return cls(read, at, things, each[k][at], starts, bad, fine)
 
-    def of_quantity(self, quantity: Quantity) -> np.ndarray:
-        return _of_picked(quantity, self.read.steps.x, self.read.agents, self.things)[self.at]
+    def of_quantities(self, quantities: Sequence[Quantity]) -> np.ndarray:
+        """(M, K) what each is."""
+        x, agents = self.read.steps.x, self.read.agents
+        return np.stack([_of_picked(one, x, agents, self.things)[self.at] for one in quantities], -1)
 
-    def likeliest(self, numbers: np.ndarray, raw: bool = False) -> tuple[float, np.ndarray]:
-        """(loss, weights (K,) of numbers (M, K), in deviations of each or as they are) by which the condition makes
-        steps likeliest: a noisy-or over all that is near, whose log-odds are linear."""
+    def likeliest(self, quantities: Sequence[Quantity], raw: bool = False) -> tuple[float, np.ndarray]:
+        """(loss, weights (K,) of quantities, in deviations of each or as they are) by which the condition makes steps
+        likeliest: a noisy-or over all that is near, whose log-odds are linear."""
         from scipy.optimize import minimize  # slow to import, and read by fits alone
 
+        numbers = self.of_quantities(quantities)
         spread = numbers.std(0)
         usable = spread > 0
         unit = float(self.values.std()) or 1.0
@@ -193,23 +191,21 @@ class _Near:
         weights[usable] = found.x[1:-1] / max(abs(found.x[0]), 1e-6) * (unit / spread[usable] if raw else 1.0)
         return float(found.fun), weights
 
-    def refined(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
-        """Weights of numbers by which fewest steps are told wrongly, each in turn, and where danger begins."""
-        at = 0.0
+    def refined(self, quantities: Sequence[Quantity], weights: np.ndarray) -> tuple[np.ndarray, float]:
+        """Weights of quantities by which fewest steps are told wrongly, each in turn, and where danger begins."""
+        numbers, at = self.of_quantities(quantities), 0.0
         for factor in RATIOS[1:]:
             for k in range(len(weights)):
                 tried = [np.where(np.arange(len(weights)) == k, weights * factor**i, weights) for i in range(-3, 4)]
                 found = [self.best(numbers, each) for each in tried]
-                alike = [i for i, (wrong, _) in enumerate(found) if wrong == min(found)[0]]
-                weights, at = tried[alike[len(alike) // 2]], found[alike[len(alike) // 2]][1]
+                best = _middle_of_best(found)
+                weights, at = tried[best], found[best][1]
         return weights, at
 
     def best(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
         """(steps that the condition tells wrongly with these weights of numbers, where danger begins)."""
         worst = np.minimum.reduceat(self.values + numbers @ weights.astype(np.float32), self.starts)
-        tried, wrong = told_wrong(np.sort(worst[self.bad]), np.sort(worst[self.fine]))
-        best = int(wrong.argmin())
-        return int(wrong[best]), float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
+        return parted(worst[self.bad], worst[self.fine])
 
 
 def _conditions(one: Counted) -> tuple[Sum, ...]:
@@ -283,11 +279,9 @@ def _fitted(read: _Read, sides: list[_Side]) -> list[_Side]:
         before = sides
         for k, side in enumerate(sides):
             score = np.where(_highest(read, sides, k) < 0, side.sign * read.values[..., side.number], np.inf)
-            tried, wrong = read.wrong(score)
-            if len(tried):
-                best = int(wrong.argmin())
-                at = 0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)])
-                sides = [*sides[:k], replace(side, at=float(at)), *sides[k + 1 :]]
+            at = read.parted(score)[1]
+            if np.isfinite(at):
+                sides = [*sides[:k], replace(side, at=at), *sides[k + 1 :]]
         if sides == before:
             break
     for side in list(sides):
@@ -331,15 +325,13 @@ def _line(read: _Read, cells: Cells) -> tuple[tuple[float, float], float, float]
     weight, at = 1.0, 0.0
     for factor, either in zip(RATIOS, TRIED):
         tried = [weight * factor**k for k in range(-either, either + 1)]
-        found = [_best(read, one + np.float32(w) * two) for w in tried]
-        least = min(count for count, _ in found)
-        best = [k for k, (count, _) in enumerate(found) if count == least]
-        weight, at = tried[best[len(best) // 2]], found[best[len(best) // 2]][1]
+        found = [read.parted(one + np.float32(w) * two) for w in tried]
+        best = _middle_of_best(found)
+        weight, at = tried[best], found[best][1]
     return sign, weight, at
 
 
-def _best(read: _Read, score: np.ndarray) -> tuple[int, float]:
-    """(steps that it tells wrongly, where danger begins) of a score (T, P)."""
-    tried, wrong = read.wrong(score)
-    best = int(wrong.argmin())
-    return int(wrong[best]), float(0.5 * (tried[best] + tried[min(best + 1, len(tried) - 1)]))
+def _middle_of_best(found: Sequence[tuple[int, float]]) -> int:
+    """Of what tells fewest steps wrongly, the one in the middle."""
+    alike = [k for k, (wrong, _) in enumerate(found) if wrong == min(found)[0]]
+    return alike[len(alike) // 2]

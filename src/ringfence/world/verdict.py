@@ -4,7 +4,6 @@ guards look by themselves, by how well it predicts."""
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from typing import Literal
 
@@ -12,7 +11,7 @@ from msgspec.structs import replace
 
 from ringfence.errors import UserError
 from ringfence.logs.late import Lateness
-from ringfence.world.card import FARTHEST, JUDGED, PUT, Avoidable, BarrierScores, Card, Look, Verdict
+from ringfence.world.card import FARTHEST, JUDGED, PUT, UNNAMED, Avoidable, BarrierScores, Card, Look, Verdict
 from ringfence.world.causes import Found
 
 Word = Literal["fit", "weak", "unfit"]
@@ -25,7 +24,6 @@ FORESEEN = (0.5, 0.95)  # share of entries into danger that are predicted to hav
 AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could have avoided, as it predicts
 NOTHING = 1.0  # error of predictions as a share of what changes: to predict that nothing changes errs by as much
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
-UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
 LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V sees in time what they do not
 BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
