@@ -242,6 +242,31 @@ def test_danger_may_be_a_sum_over_the_team(weights):
     assert not any("team" in cause.name for cause in alone.causes)
 
 
+@pytest.mark.parametrize("room", [12.0, 58.0, 3000.0])
+def test_near_and_fast_is_found_however_large_the_room_is(room):
+    """Who walks through a city is in danger within half a metre: of equal slices of the city that is nothing."""
+    rng = np.random.default_rng(0)
+    offset = rng.uniform(-room, room, (9000, 2, 1, 2))
+    offset[::4] = rng.normal(0, 0.6, (2250, 2, 1, 2))
+    own = rng.normal(0, 0.6, (9000, 2, 2))
+    unsafe = (np.linalg.norm(offset[..., 0, :], axis=-1) < 0.5) & (np.linalg.norm(own, axis=-1) > 0.6)
+    x = np.concatenate([own, offset[..., 0, :]], -1).astype(np.float32)
+    found, _ = cause_search.find(x, unsafe, np.arange(9000) // 30, ["own.vx", "own.vy", "other.dx", "other.dy"])
+    (cause,) = found.causes
+    assert cause.name == "other.distance below 0.5 and length of own.vx, own.vy above 0.6"
+    assert found.explained > 0.98 and found.false_alarms < 0.001
+
+
+def test_a_threshold_that_depends_on_more_moves_the_others():
+    """Too soon behind the car ahead in one's lane: where danger begins aside is known once how soon is."""
+    rng = np.random.default_rng(0)
+    ahead, aside, drift = (rng.uniform(*ends, (20_000, 2)) for ends in ((-40, 40), (-8, 8), (-6, 6)))
+    unsafe = (ahead > 0) & (np.abs(aside) < 1.8) & (drift < 0) & (ahead - 4.5 < -1.5 * drift)
+    x = np.stack([ahead, aside, drift], -1).astype(np.float32)
+    found, _ = cause_search.find(x, unsafe, np.arange(20_000) // 40, ["other.ds", "other.dd", "other.dvs"])
+    assert found.explained > 0.97 and found.false_alarms < 0.002 and found.edges[0].bounds
+
+
 def test_thresholds_may_depend_on_other_numbers():
     """Boxes as long as both are, side by side; and a limit that falls along a way."""
     rng = np.random.default_rng(0)
@@ -430,7 +455,7 @@ def cells_of(pattern, length=True, visits=100.0):
     danger = np.array([v or 0.0 for v in pattern])
     entry = Entry((0,), "d")
     cause = Cause((Length((entry,)) if length else entry,))
-    return Cells(cause, np.zeros(1), np.ones(1), len(pattern), visits * known, danger)
+    return Cells(cause, np.linspace(0, 1, len(pattern) + 1)[None], visits * known, danger)
 
 
 def test_an_edge_does_not_flicker_and_unvisited_ends_are_unsafe():
@@ -646,7 +671,9 @@ def test_a_cause_of_a_place_has_a_map():
 def test_a_world_that_is_unfit_is_refused_unless_one_insists():
     chance = np.random.default_rng(3)
     world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK_WORLD)
-    assert world.card.verdict.word == "unfit" and world.card.causes == {"": Found()}, "no cause explains chance"
+    assert world.card.verdict.word == "unfit" and world.card.causes == {"": Found(searched=True)}, (
+        "no cause explains chance"
+    )
     assert any(remedy.startswith("log what tells danger") for remedy in world.card.verdict.remedies), "all are named"
     still = lambda observations, state: np.zeros((N, 2))  # noqa: E731
     with pytest.raises(UserError, match="'walks' is unfit to guard by: only .*anyway=True"):
@@ -684,6 +711,9 @@ def test_verdicts_give_their_reasons():
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, recall=recall), causes=causes))
         assert found.word == word and (word == "fit" or f"tell only {told:.1%} of the danger" in found.reasons[0])
         assert word == "fit" or "give a formula of danger" in found.remedies[0]
+    for searched, word in ((True, "weak"), (False, "fit")):
+        none = verdict.judge(Card(data=data, barrier=good, causes={"": Found(searched=searched)}))
+        assert none.word == word and (word == "fit" or none.reasons[0].startswith("no cause of its danger is found"))
     for names, remedy in (
         (("obs0", "obs1"), "name the entries that tell danger, or log them"),
         (("own.x", "own.y"), "log what tells danger, if it is not among the entries, or give a formula"),

@@ -16,7 +16,7 @@ import numpy as np
 
 from ringfence.world.causes import Cause, Edge, narrowed
 from ringfence.world.cells import CELLS, Cells
-from ringfence.world.quantities import Entry, from_zero
+from ringfence.world.quantities import Entry, Quantity, from_zero, is_condition
 
 UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
 SAFE_STEPS = 120_000  # likewise
@@ -24,6 +24,12 @@ FOLDS = 3
 SUFFICIENT = 0.3  # share of unsafe steps, beyond what others explain, at which a cell is dangerous
 CLEAR = 0.8  # probability of danger of cells whose neighbours may hold an edge
 PRIOR = 2.0  # safe visits that every cell is taken to have had
+SAMPLED = 20_000  # steps, of which it is told where cells are cut
+TAILS = (0.0005, 0.9995)  # of what was seen, outside of which nothing is cut
+RANKS = 200  # of unsafe steps, between which these are compared with safe ones, at most
+VISITS = 20  # of unsafe steps between two ranks, at least
+FINE = 3.0  # cells that half of the danger lies in, at least
+CLEARLY = 3.0  # standard errors, by which unsafe steps have to be more
 AROUND = 3.0  # cells to either side that an edge is looked for in
 
 
@@ -37,17 +43,42 @@ class Steps:
     episode: np.ndarray  # (T,)
     low: np.ndarray  # (D,) of nearly all that was seen
     high: np.ndarray  # (D,)
-    seen: dict[Cause, tuple[np.ndarray, np.ndarray, int, np.ndarray]]  # ranges, cells along an axis, cells of steps
+    seen: dict[Cause, tuple[np.ndarray, np.ndarray]]  # where cells are cut, cells of steps
+    read: dict[tuple[Quantity, int], tuple[np.ndarray, np.ndarray]]  # where numbers are cut, and which part each is in
+    ways: dict[Quantity, tuple[np.ndarray, np.ndarray, np.ndarray]]  # values, shares of range and of danger below
     fine: dict[Cause, np.ndarray]  # safe visits
 
-    def cells(self, cause: Cause) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-        """(low, high, cells along each axis, (T, N, J) cell of each thing in the part of its episode); remembered."""
+    def cells(self, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
+        """((width, B + 1) where cells are cut along each axis, (T, N, J) cell of each thing, in the part of its
+        episode); remembered."""
         if cause not in self.seen:
-            low, high = _range(self, cause)
             bins = _bins(cause, len(self.x) * self.x.shape[1])
-            cell = _cell(cause, self.x, low, high, bins) + bins**cause.width * self.fold[:, None, None]
-            self.seen[cause] = low, high, bins, cell.astype(np.int32)
+            read = [self._read(one, bins) for one in cause.reads]
+            cell = self.fold[:, None, None].astype(np.int32)
+            for _, places in read:
+                cell = cell * np.int32(bins) + places
+            self.seen[cause] = np.stack([cuts for cuts, _ in read]), cell
         return self.seen[cause]
+
+    def _read(self, read: Quantity, bins: int) -> tuple[np.ndarray, np.ndarray]:
+        """((bins + 1,) where cells of a number are cut, (T, N, J) the one that each is in); remembered."""
+        if (read, bins) not in self.read:
+            cuts = self._cuts(read, bins)
+            self.read[read, bins] = cuts, _places(cuts, read.of(self.x))
+        return self.read[read, bins]
+
+    def _cuts(self, read: Quantity, bins: int) -> np.ndarray:
+        """(bins + 1,) where cells of a number begin and end: equally long, but that half of its danger has FINE of
+        them, however little of the range that is. Who roams over a city is in danger within a metre."""
+        if read not in self.ways:
+            self.ways[read] = _way(self, read)
+        values, spread, danger = self.ways[read]
+        dense = np.argsort(-np.diff(danger) / np.maximum(np.diff(spread), 1e-12))
+        half = dense[: np.searchsorted(np.cumsum(np.diff(danger)[dense]), 0.5) + 1]
+        lacking = FINE / bins - np.diff(spread)[half].sum() if danger[-1] else 0.0
+        more = np.clip(2 * lacking, 0.0, 0.5)
+        way = (1 - more) * spread + more * danger
+        return np.interp(np.linspace(0.0, 1.0, bins + 1), way, values).astype(self.x.dtype)
 
     def picked(self, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
         """((T, P) cells of the agents and things that a cause is about, (P,) whose they are); those of a cause of all
@@ -56,12 +87,15 @@ class Steps:
         agents, things = np.nonzero(cause.holds(cell.shape[1]))
         return cell[:, agents, things], agents
 
+    def size(self, cause: Cause) -> int:
+        """How many cells there are."""
+        return (self.cells(narrowed(cause, ()))[0].shape[1] - 1) ** cause.width
+
     def safe_visits(self, cause: Cause) -> np.ndarray:
         """(FOLDS, cells) in safe steps; remembered."""
         if cause not in self.fine:
             cell, agents = self.picked(cause)
-            bins = self.cells(narrowed(cause, ()))[2]
-            self.fine[cause] = self.visits(cell, agents, ~self.unsafe, bins**cause.width)
+            self.fine[cause] = self.visits(cell, agents, ~self.unsafe, self.size(cause))
         return self.fine[cause]
 
     def visits(self, cell: np.ndarray, agents: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:
@@ -83,7 +117,7 @@ class Steps:
     def part(self, some: np.ndarray) -> Steps:
         """Those of the steps, `some` (T,) bool."""
         taken = {name: getattr(self, name)[some] for name in ("x", "unsafe", "fold", "episode")}
-        return replace(self, **taken, seen={}, fine={})
+        return replace(self, **taken, seen={}, read={}, ways={}, fine={})
 
     @property
     def each(self) -> bool:
@@ -141,9 +175,9 @@ def some_steps(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, rng: np.r
     x = np.asarray(x[some], np.float32)
     # Whole teams are left out: every other row of all agents' would be of every other agent.
     flat = x[:: max(1, x[..., 0].size // 200_000)].reshape(-1, x.shape[-1])
-    low, high = np.quantile(flat, [0.0005, 0.9995], axis=0)
+    low, high = np.quantile(flat, TAILS, axis=0)
     fold = rng.permutation(int(episode.max()) + 1) % FOLDS
-    return Steps(x, unsafe[some], fold[episode[some]], episode[some], low, high, {}, {})
+    return Steps(x, unsafe[some], fold[episode[some]], episode[some], low, high, {}, {}, {}, {})
 
 
 def _sampled(bad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -192,13 +226,13 @@ class Explained:
 
 def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
     """The cause, by what others leave unexplained."""
-    low, high, bins, _ = steps.cells(narrowed(cause, ()))
+    cuts = steps.cells(narrowed(cause, ()))[0]
     cell, agents = steps.picked(cause)
     left = explained.left
-    bad, fine = steps.visits(cell, agents, left, bins**cause.width), steps.safe_visits(cause)
+    bad, fine = steps.visits(cell, agents, left, steps.size(cause)), steps.safe_visits(cause)
     usual = left.sum() / max(left.sum() + (~steps.unsafe).sum(), 1.0)
     all_bad, all_fine = bad.sum(0), fine.sum(0)
-    cells = Cells(cause, low, high, bins, all_bad + all_fine, _danger(all_bad, all_fine, usual))
+    cells = Cells(cause, cuts, all_bad + all_fine, _danger(all_bad, all_fine, usual))
     others = _danger(all_bad - bad, all_fine - fine, usual)  # (FOLDS, size)
     visited = all_bad + all_fine - bad - fine > 0
     if not others.any():
@@ -245,30 +279,60 @@ def likelihood(steps: Steps, safe: np.ndarray) -> np.ndarray:
     return np.where(steps.unsafe, np.log(chance), np.log1p(-chance))
 
 
-def _range(steps: Steps, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
-    at = [list(read.at) for read in cause.reads if isinstance(read, Entry)]
-    if len(at) == cause.width:
-        return np.array([steps.low[d].min() for d in at]), np.array([steps.high[d].max() for d in at])
-    some = cause.of(steps.x[:: max(1, len(steps.x) // 20_000)])
-    low, high = np.quantile(some, [0.0005, 0.9995], axis=tuple(range(some.ndim - 1)))
-    if cause.is_rule:  # what is in danger is rare
-        low = np.asarray(cause.of(steps.x).min(), float)[None]
-    return np.array([0.0 if from_zero(read) else least for read, least in zip(cause.reads, low)]), high
+def _way(steps: Steps, read: Quantity) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(values of a number, the share of its range below each, and the share of its danger: of what unsafe steps clearly
+    are more often than safe ones, none where they are not)."""
+    bad, fine = _some_values(steps, read, steps.unsafe), _some_values(steps, read, ~steps.unsafe)
+    if isinstance(read, Entry):
+        low, high = steps.low[list(read.at)].min(), steps.high[list(read.at)].max()
+    else:
+        low, high = np.quantile(read.of(steps.x[:: max(1, len(steps.x) // SAMPLED)]), TAILS)
+    low = 0.0 if from_zero(read) else low
+    if is_condition(read):  # what is in danger is rare
+        low = min(low, float(read.of(steps.x).min()))
+    high = max(high, low + 1e-9)
+    ranks = np.linspace(0.0, 1.0, int(np.clip(len(bad) / VISITS, 1, RANKS)) + 1)
+    values = np.unique([low, *np.clip(np.quantile(bad, ranks) if len(bad) else [], low, high), high])
+    spread = (values - low) / (high - low)
+    shares = [
+        np.diff(np.searchsorted(np.sort(some), values[1:-1], "right"), prepend=0, append=len(some)) / max(len(some), 1)
+        for some in (bad, fine)
+    ]
+    error = np.sqrt(shares[0] / max(len(bad), 1) + shares[1] / max(len(fine), 1))
+    more = np.maximum(shares[0] - shares[1] - CLEARLY * error, 0.0)
+    return values, spread, np.cumsum([0.0, *more]) / max(more.sum(), 1e-12)
+
+
+def _some_values(steps: Steps, read: Quantity, of: np.ndarray) -> np.ndarray:
+    """(S,) of a number in some of these steps (T,) or (T, N) bool: of how far things are, of the nearest."""
+    rows = np.flatnonzero(of if of.ndim == 1 else of.any(1))
+    rows = rows[:: max(1, len(rows) // SAMPLED)]
+    values = np.asarray(read.of(steps.x[rows]))
+    if from_zero(read):
+        values = values.min(-1, keepdims=True)
+    if of.ndim == 2:
+        values = values[of[rows]]
+    elif from_zero(read):
+        values = values.min(1)
+    return values.ravel()
+
+
+def _places(cuts: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Which cell values are in, 255 at most: as that of the slice of the range that each is in, and from there on."""
+    bins, low, high = len(cuts) - 1, cuts[0], cuts[-1]
+    slices = 16 * bins
+    begins = np.linspace(low, high, slices, endpoint=False, dtype=cuts.dtype)
+    upper = np.append(cuts[1:-1], np.inf).astype(cuts.dtype)
+    scaled = np.clip((values - low) * (slices / (high - low)), 0, slices - 1)
+    found = np.searchsorted(cuts[1:-1], begins, "right").astype(np.uint8)[scaled.astype(np.int32)]
+    while (beyond := values >= upper[found]).any():
+        found += beyond
+    return found
 
 
 def _bins(cause: Cause, samples: int) -> int:
     most = CELLS[cause.width]
     return int(np.clip((samples / 20) ** (1 / cause.width), 6, most))
-
-
-def _cell(cause: Cause, x: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int) -> np.ndarray:
-    """(T, N, J) the cell of each thing."""
-    scaled = (cause.of(x) - low) / np.maximum(high - low, 1e-9) * bins
-    places = np.clip(scaled, 0, bins - 1).astype(np.int64)
-    cell = places[..., 0]
-    for k in range(1, cause.width):
-        cell = cell * bins + places[..., k]
-    return cell
 
 
 # --- edges ---
@@ -306,9 +370,11 @@ def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edg
 
 def signed(values: np.ndarray, edge: Edge) -> np.ndarray:
     """Distances of values to where danger begins, below 0 in danger."""
-    offset = values[..., None] - np.array(edge.bounds)
-    safe = ((offset > 0).sum(-1) % 2 == 1) == edge.inside
-    return np.where(safe, 1.0, -1.0) * np.abs(offset).min(-1)
+    passed, far = np.zeros(values.shape, bool), np.full(values.shape, np.inf)
+    for bound in edge.bounds:
+        passed ^= values > bound
+        np.minimum(far, np.abs(values - bound), out=far)
+    return np.where(passed == edge.inside, far, -far)
 
 
 def of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: np.ndarray) -> np.ndarray:

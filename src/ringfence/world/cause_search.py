@@ -58,7 +58,7 @@ def find(
     steps = some_steps(x, unsafe, episode, np.random.default_rng([seed, 5]))
     chosen = _with_more_shapes(steps, _split(steps, _best_grown(steps, names), names), names, team)
     if not chosen:
-        return Found(), []
+        return Found(searched=True), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
     edges = [refined(steps, one.cells.edge, one.cause, _without(steps, chosen, one)) for one in chosen]
     alike = _siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
@@ -68,7 +68,7 @@ def find(
     kept = _needed(steps, called)
     chosen, called = [chosen[k] for k in kept], [called[k] for k in kept]
     edges = [edges[k] for k in kept]
-    return replace(_summary(steps, chosen, called), edges=tuple(edges)), [one.cells for one in chosen]
+    return replace(_summary(steps, chosen, called), edges=tuple(edges), searched=True), [one.cells for one in chosen]
 
 
 def _needed(steps: Steps, called: list[np.ndarray]) -> list[int]:

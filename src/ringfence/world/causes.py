@@ -144,6 +144,7 @@ class Found(msgspec.Struct, frozen=True):
     false_alarms: float = 0.0  # share of safe steps that a cause calls unsafe
     shares: tuple[float, ...] = ()  # by cause: share of unsafe steps that it explains
     edges: tuple[Edge, ...] = ()  # by cause
+    searched: bool = False  # whether any were looked for
 
 
 def only_of(cause: Cause, n_agents: int) -> Iterator[Cause]:

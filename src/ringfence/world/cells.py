@@ -23,17 +23,33 @@ class Cells:
     """Where a cause is dangerous, cell by cell."""
 
     cause: Cause
-    low: np.ndarray  # (width,) where cells begin
-    high: np.ndarray  # (width,) where they end
-    bins: int  # along each axis
+    cuts: (
+        np.ndarray
+    )  # (width, bins + 1) where cells begin and end along each axis, the shorter the more danger is there
     visits: np.ndarray  # (bins ** width,) by safe and unsafe steps
     danger: np.ndarray  # (bins ** width,) probability that being there makes a step unsafe
+
+    @property
+    def low(self) -> np.ndarray:
+        """(width,) where cells begin."""
+        return np.asarray(self.cuts[:, 0], float)
+
+    @property
+    def high(self) -> np.ndarray:
+        """(width,) where they end."""
+        return np.asarray(self.cuts[:, -1], float)
+
+    @property
+    def bins(self) -> int:
+        """Along each axis."""
+        return self.cuts.shape[1] - 1
 
     def known(self) -> tuple[np.ndarray, np.ndarray]:
         """(centres (K, width), unsafe (K,) bool) of the cells that were visited."""
         cell = np.flatnonzero(self.visits >= VISITED)
         places = np.stack(np.unravel_index(cell, (self.bins,) * len(self.low)), -1)
-        centres = self.low + (places + 0.5) / self.bins * (self.high - self.low)
+        middles = 0.5 * (self.cuts[:, 1:] + self.cuts[:, :-1])
+        centres = np.take_along_axis(middles.T.astype(float), places, 0)
         return centres, self.danger[cell] > 0.5
 
     @property
@@ -44,7 +60,7 @@ class Cells:
             return Edge(low, high)
         unsafe = self._unsafe_along()
         turns = np.flatnonzero(unsafe[1:] != unsafe[:-1]) + 1
-        bounds = [float(self.low[0] + k * self.size) for k in turns]
+        bounds = [float(self.cuts[0, k]) for k in turns]
         unseen = [False] * len(bounds)
         inside = bool(unsafe[0])
         at = round(bounds[0], 4) if len(bounds) == 1 or (bounds and self.cause.goes_on) else None
@@ -59,7 +75,7 @@ class Cells:
 
     @property
     def size(self) -> float:
-        """How long a cell is along the first axis."""
+        """How long a cell is along the first axis, in the mean."""
         return float(self.high[0] - self.low[0]) / self.bins
 
     def _unsafe_along(self) -> np.ndarray:
@@ -69,9 +85,10 @@ class Cells:
         called_safe = np.where(known, self.visits * self.danger, 0.0)
         called_unsafe = np.where(known, self.visits * (1.0 - self.danger), 0.0)
         # What nobody visited is like the nearest, or, but of a distance, unsafe where that is far.
-        nearest = np.abs(np.arange(self.bins)[:, None] - np.flatnonzero(known)[None])
+        middles = 0.5 * (self.cuts[0, 1:] + self.cuts[0, :-1])
+        nearest = np.abs(middles[:, None] - middles[known])
         like = self.danger[np.flatnonzero(known)[nearest.argmin(1)]] > 0.5
-        far = nearest.min(1) > 0.5 * GAP * self.bins
+        far = nearest.min(1) / self.size > 0.5 * GAP * self.bins + 1e-6
         most, share = TURNS
         turn = min(most, share * called_safe.sum())
         called_safe = np.where(known, called_safe, 1e-3 * like)

@@ -41,9 +41,9 @@ from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World, blank_world
 
-FORMAT = 12  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
+FORMAT = 13  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
-ENOUGH = 0.95  # recall of causes, below which networks on all entries are tried, too
+ENOUGH = 0.9  # recall of causes, below which networks on all entries are tried, too
 STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
@@ -302,9 +302,10 @@ class _Danger:
         found = self.causes()
         label = self.label(found)
         if found.causes and (recall := self._recall(label)) < ENOUGH:
-            plain = self.label(Found())
+            none = Found(searched=True)
+            plain = self.label(none)
             if self._recall(plain) > recall:
-                found, label = Found(), plain
+                found, label = none, plain
         return found, self.with_future(label, found)
 
     def _recall(self, label: cbf.Barrier) -> float:
@@ -317,7 +318,7 @@ class _Danger:
         if not plain or self.logged.map.shared_body or self.logged.map.joint:
             return Found()
         found = self.of.found("causes", self._content(), Found, lambda: self.search[0])
-        return found if found.explained >= EXPLAINED else Found()
+        return found if found.explained >= EXPLAINED else Found(searched=True)
 
     @functools.cached_property
     def search(self) -> tuple[Found, list[Cells]]:

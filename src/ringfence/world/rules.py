@@ -12,7 +12,7 @@ import numpy as np
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
 from ringfence.world.causes import Cause
 from ringfence.world.cells import VISITED, Cells
-from ringfence.world.quantities import All, Over, Quantity, Sum
+from ringfence.world.quantities import All, Entry, Over, Quantity, Sum
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
@@ -23,6 +23,8 @@ RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tr
 TRIED = (10, 3, 3, 3)  # such factors to either side
 WEIGHTS = (0.5, 0.7, 1.4, 2.0)  # times which an agent's weight in a sum is tried
 MOST_TERMS = 3  # that a threshold depends on
+AS_LIKELY = 0.02  # of a loss, by which it may be more where what is read is simpler
+LIKELY = 5  # numbers, of which these are
 FEW = 30  # steps of either kind, below which no threshold is a line
 
 
@@ -91,15 +93,36 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     if best is None:
         return
     _, k, few, weights = best
-    whole = _Near.of(_read(steps, one, explained)[0], one.cause, conditions, k)
-    order = np.argsort(-np.abs(weights))
-    for count in range(1, min(MOST_TERMS, int((weights != 0).sum())) + 1):
-        terms = [more[j] for j in order[:count]]
+    read = _read(steps, one, explained)[0]
+    whole = _Near.of(read, one.cause, conditions, k)
+    likely = [more[j] for j in np.argsort(-np.abs(weights))[:LIKELY] if weights[j]]
+    terms: list[Quantity] = []
+    while likely and len(terms) < MOST_TERMS:
+        losses = [few.likeliest([*terms, one])[0] for one in likely]
+        alike = (one for one, loss in zip(likely, losses) if loss <= (1 + AS_LIKELY) * min(losses))
+        terms = [*terms, min(alike, key=lambda one: not isinstance(one, Entry))]
+        likely.remove(terms[-1])
         found, at = whole.refined(terms, few.likeliest(terms, raw=True)[1])
-        old = conditions[k]
-        new = Sum((*old.parts, *terms), (*old.weights, *(float(w) for w in found)), float((old.more or 0.0) - at))
-        parts = (*conditions[:k], new, *conditions[k + 1 :])
+        old, weights = conditions[k], tuple(float(w) for w in found)
+        new = Sum((*old.parts, *terms), (*old.weights, *weights), float((old.more or 0.0) - at))
+        numbers = whole.of_quantities(terms)
+        alone = replace(whole, values=np.zeros_like(whole.values)).best(numbers, found)
+        if alone[0] <= whole.best(numbers, found)[0] + NEEDLESS * whole.bad.sum():  # nothing is left of the old one
+            unit = float(whole.values.std() / max((numbers @ found).std(), 1e-9))
+            new = Sum(tuple(terms), tuple(unit * w for w in weights), -unit * alone[1])
+        parts = _settled(read, one.cause, (*conditions[:k], new, *conditions[k + 1 :]))
         yield _reading(one.cause, parts[0] if len(parts) == 1 else All(parts))
+
+
+def _settled(read: _Read, cause: Cause, conditions: tuple[Sum, ...]) -> tuple[Sum, ...]:
+    """The conditions, each in turn where it tells fewest steps wrongly beside the others."""
+    for k, one in enumerate(conditions):
+        near = _Near.of(read, cause, conditions, k)
+        at = near.best(np.zeros((len(near.values), 0)), np.zeros(0))[1]
+        if near.bad.any() and near.fine.any() and np.isfinite(at):
+            moved = Sum(one.parts, one.weights, float((one.more or 0.0) - at))
+            conditions = (*conditions[:k], moved, *conditions[k + 1 :])
+    return conditions
 
 
 def weighted_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause]:
@@ -265,11 +288,11 @@ def _box(cells: Cells, scale: np.ndarray) -> list[_Side]:
         share = np.cumsum(weight[order]) / max(weight.sum(), 1e-9)
         ends = (min(np.searchsorted(share, q), len(order) - 1) for q in (STRAY, 1 - STRAY))
         first, last = (int(dangerous[order[end], k]) for end in ends)
-        begin, size = cells.low[k] / scale[k], 1.0 / cells.bins
+        cuts = cells.cuts[k] / scale[k]
         if last < places[:, k].max():
-            sides.append(_Side(k, 1.0, begin + (last + 1) * size))
+            sides.append(_Side(k, 1.0, float(cuts[last + 1])))
         if first > places[:, k].min():
-            sides.append(_Side(k, -1.0, -(begin + first * size)))
+            sides.append(_Side(k, -1.0, -float(cuts[first])))
     return sides
 
 

@@ -49,7 +49,7 @@ def judge(card: Card) -> Verdict:
         found += _barrier(scores, f" of '{name}'", untold)
     scores = card.constraints or {"": card.barrier}
     for name, causes in card.causes.items():
-        found += _told(causes, scores.get(name, card.barrier).recall, f" of '{name}'" if name else "")
+        found += _told(causes, scores.get(name, card.barrier).recall, f" of '{name}'" if name else "", untold)
     found += _prediction(card)
     found += _late(Lateness(card.data.late))
     worst: Word = "fit"
@@ -114,8 +114,14 @@ def _radius(scores: BarrierScores) -> str:
     return " and ".join(put) or "danger begins"
 
 
-def _told(causes: Found, recall: float, of: str) -> Iterator[tuple[Word, str, str]]:
-    """What causes leave out: a score of theirs may find much of it, in the logs, and holds nobody off the rest."""
+def _told(causes: Found, recall: float, of: str, untold: str) -> Iterator[tuple[Word, str, str]]:
+    """What causes leave out, all where none is found: a score may find much of it, in the logs, and holds nobody off
+    the rest."""
+    if causes.searched and not causes.causes:
+        reason = (
+            f"no cause of its danger{of} is found: a network on all entries tells it, which knows no place but those"
+        )
+        yield "weak", f"{reason} that were logged", untold
     word = _word(causes.explained, TOLD)
     if causes.causes and word != "fit" and recall < NEARLY_ALL:
         yield word, f"its causes tell only {causes.explained:.1%} of the danger{of}", FORMULA
