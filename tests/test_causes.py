@@ -711,8 +711,8 @@ def test_verdicts_give_their_reasons():
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, recall=recall), causes=causes))
         assert found.word == word and (word == "fit" or f"tell only {told:.1%} of the danger" in found.reasons[0])
         assert word == "fit" or "give a formula of danger" in found.remedies[0]
-    for searched, word in ((True, "weak"), (False, "fit")):
-        none = verdict.judge(Card(data=data, barrier=good, causes={"": Found(searched=searched)}))
+    for looked, word in ((True, "weak"), (False, "fit")):
+        none = verdict.judge(Card(data=data, barrier=good, causes={"": Found(searched=looked)}))
         assert none.word == word and (word == "fit" or none.reasons[0].startswith("no cause of its danger is found"))
     for names, remedy in (
         (("obs0", "obs1"), "name the entries that tell danger, or log them"),

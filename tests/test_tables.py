@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import ringfence
 from ringfence.cli import app
 from ringfence.datasets.audit import odd_actions
 from ringfence.errors import StoreError, UserError
+from ringfence.logs import large
 from ringfence.logs.io.columns import numbers
 from ringfence.logs.io.observe import observe
 from ringfence.logs.io.table_schema import TableSchema
@@ -672,3 +674,88 @@ def test_agents_whose_rows_come_between_those_of_others_lose_no_command(after):
     table |= {"a": np.tile(k * 1.0, 2), "hit": np.zeros(1000)}
     store = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], action=["a"], cost="hit")
     assert store.steps > 490 and (np.diff(store.actions[:, :, 0], axis=0) == 1).all()
+
+
+# --- larger than memory ---
+
+
+def written(table: dict[str, np.ndarray], file: Path) -> Path:
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import csv, parquet
+
+    (csv.write_csv if file.suffix == ".csv" else parquet.write_table)(pyarrow.table(table), file)
+    return file
+
+
+@pytest.mark.parametrize("kind", [".csv", ".parquet"])
+def test_a_table_that_is_read_in_parts_makes_the_same_store(tmp_path, kind):
+    """Recordings are not cut where parts end, and nothing tells that there were any."""
+    table = fleet(episodes=20)
+    options = {**NAMES, "card": {"task": "fleet"}}
+    whole = EpisodeStore.from_table(table, **options)
+    file = written(table, tmp_path / f"fleet{kind}")
+    made = large.import_large([file], tmp_path / "fleet.h5", rows=150, quiet=True, **options)
+    parts = EpisodeStore.load(tmp_path / "fleet.h5")
+    assert (made.episodes, made.steps) == (parts.episodes, parts.steps) == (20, 220)
+    for name in ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends"):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=2e-6, err_msg=name)
+    assert parts.card.updated(warnings=[], action_low=-1, action_high=1) == whole.card.updated(
+        warnings=[], action_low=-1, action_high=1
+    )
+    assert [p.name for p in tmp_path.iterdir() if p.name not in (file.name, "fleet.h5")] == []
+
+
+def test_a_long_recording_is_cut_where_a_part_ends_and_loses_no_step(tmp_path):
+    table = fleet(episodes=1, steps=300)
+    table["x"] += 5e6  # of a map
+    names = {k: v for k, v in NAMES.items() if k != "episode"}
+    whole = EpisodeStore.from_table(table, **names)
+    file = written(table, tmp_path / "day.parquet")
+    large.import_large([file], tmp_path / "day.h5", rows=200, quiet=True, **names)
+    parts = EpisodeStore.load(tmp_path / "day.h5")
+    assert whole.episodes == 1 and parts.episodes == 5 and parts.steps == whole.steps == 299
+    assert parts.costs.sum() == whole.costs.sum() and parts.card.observation_origins
+    np.testing.assert_allclose(parts.actions, whole.actions)
+    origin = parts.card.observation_origins[parts.card.observation_names.index("own.x")]
+    x = entry(parts, "own.x").astype(float) + origin
+    assert abs(np.delete(x, parts.first_rows[1:], 0) - table["x"].reshape(300, 3)).max() < 1e-2
+
+
+def test_what_cannot_be_read_in_parts_is_refused_and_leaves_nothing(tmp_path):
+    table = fleet(episodes=1, steps=300)
+    by_agent = np.argsort(table["id"], kind="stable")
+    names = {k: v for k, v in NAMES.items() if k != "episode"}
+    for order, options in ((by_agent, names), (np.argsort(table["run"] + np.arange(900) % 7), NAMES)):
+        file = written(
+            {k: x[order] for k, x in (table | {"run": np.arange(900) % 7}).items()}, tmp_path / "odd.parquet"
+        )
+        with pytest.raises(StoreError, match=r"rows \d+ to \d+ of .* in parts; sort it by recording and time"):
+            large.import_large([file], tmp_path / "odd.h5", rows=100, quiet=True, **options)
+        assert [p.name for p in tmp_path.iterdir()] == ["odd.parquet"]
+
+
+def test_large_tables_are_read_in_parts_by_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(large, "LARGE", 100)
+    file = written(fleet(), tmp_path / "fleet.parquet")
+    given = "--time t --agent id --episode run --state x y vx vy --action ax ay --cost hit"
+    app.main(["data", "import-table", str(file), "--out", str(tmp_path / "f.h5"), *given.split()])
+    assert "6 episodes, 66 steps of 0.1 s" in capsys.readouterr().out
+    assert EpisodeStore.load(tmp_path / "f.h5").card.provenance == "table fleet.parquet"
+
+
+def test_of_a_large_store_some_episodes_are_read(tmp_path):
+    """Half of them with danger, as far as there are; its warnings say which share."""
+    table = fleet(episodes=200)
+    table["hit"] *= table["run"] % 10 == 0
+    store = EpisodeStore.from_table(table, **NAMES)
+    store.save(tmp_path / "fleet.h5")
+    size = sum(x.nbytes for x in vars(store).values() if isinstance(x, np.ndarray))
+    some = EpisodeStore.load(tmp_path / "fleet.h5", memory=size // 10)
+    assert 0 < some.steps <= store.steps // 10 and (some.episode_costs > 0).sum() in (9, 10)
+    assert some.card.warnings[-1] == (
+        f"learned from {some.steps} of 2,200 steps: {(some.episode_costs > 0).sum()} of 20 episodes with danger, and "
+        f"{(some.episode_costs == 0).sum()} of 180 others"
+    )
+    known = set(store.digests_of_episodes)
+    assert set(some.digests_of_episodes) <= known
+    assert EpisodeStore.load(tmp_path / "fleet.h5", memory=10 * size).content == store.content

@@ -709,10 +709,13 @@ def _store(data: str) -> EpisodeStore:
     """A store's file, or the data set of a task."""
     from ringfence.datasets import registry
     from ringfence.datasets.make import make
-    from ringfence.logs.store import EpisodeStore
+    from ringfence.logs.store import LEARNED, EpisodeStore
 
     if Path(data).suffix in (".h5", ".hdf5", ".hdf") or Path(data).is_file() or len(Path(data).parts) > 1:
-        return EpisodeStore.load(data)
+        store = EpisodeStore.load(data, LEARNED)
+        if store.card.warnings and store.card.warnings[-1].startswith("learned from"):
+            out.print(f"[yellow]note[/] {store.card.warnings[-1]}", soft_wrap=True)
+        return store
     return make(registry.get(data), must_keep=False)[0]
 
 

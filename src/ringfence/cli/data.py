@@ -121,6 +121,7 @@ def import_table(
         written: how files are written.
         task: a name for the data; that of the store's file by default.
     """
+    from ringfence.logs.large import import_large, is_large
     from ringfence.logs.store import EpisodeStore
 
     if not files:
@@ -141,6 +142,8 @@ def import_table(
         learned, judged = EpisodeStore.split_table(files, split, **options)
         imported(learned, kept)
         return imported(judged, rest)
+    if is_large(files, options):
+        return noted(*import_large(files, kept, **options), kept)
     made = EpisodeStore.from_table if layout is None else EpisodeStore.from_layout
     imported(made(files, **options), kept)
 
@@ -389,10 +392,16 @@ def imported(store, file: Path) -> None:
     from ringfence.datasets.audit import odd_costs
     from ringfence.logs.resolution import coarse
 
-    each = f" of {store.card.dt:g} s" if store.card.dt is not None else ""
-    summary = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
-    out.print(summary, soft_wrap=True, markup=False)
-    for note in [*store.card.warnings, *odd_costs(store), *coarse(store)]:
+    card = store.card.updated(warnings=[*store.card.warnings, *odd_costs(store), *coarse(store)])
+    store.save(file)
+    noted(card, store.episodes, store.steps, file)
+
+
+def noted(card, episodes: int, steps: int, file: Path) -> None:
+    """Say what was imported, and what was noted."""
+    each = f" of {card.dt:g} s" if card.dt is not None else ""
+    out.print(f"{episodes:,} episodes, {steps:,} steps{each}: {file}", soft_wrap=True, markup=False)
+    for note in card.warnings:
         out.print(f"[yellow]note[/] {escape(plain(note))}", soft_wrap=True)
 
 
@@ -417,9 +426,9 @@ def undelay(file: Positional[Path], out_file: Out, delay: int) -> None:
 def info(file: Positional[Path]) -> None:
     """The card of a store: sizes, returns, cost, share of episodes that start unsafe, warnings."""
     from ringfence.datasets.audit import audit
-    from ringfence.logs.store import EpisodeStore
+    from ringfence.logs.store import LEARNED, EpisodeStore
 
-    report = audit(EpisodeStore.load(file))
+    report = audit(EpisodeStore.load(file, LEARNED))
     for name, value in report.facts.items():
         out.print(terminal(f"{name:24} {value}"), soft_wrap=True)
     for note in report.notes:

@@ -20,11 +20,11 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -39,10 +39,11 @@ from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
 from ringfence.utils.files import place, whole
 from ringfence.utils.given import refuse_other_order
-from ringfence.utils.pytrees import digest_of
+from ringfence.utils.pytrees import Digest, digest_of
 
 FORMAT = 1
 HDF5_BEGINS = b"\x89HDF\r\n\x1a\n"
+LEARNED = 2 * 2**30  # bytes of logs that are learned from, at most, where a command reads them
 PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
 
 
@@ -402,7 +403,7 @@ class EpisodeStore:
         )
 
     @classmethod
-    def _of_table(cls, found: Mapping[str, Any]) -> EpisodeStore:
+    def of_read(cls, found: Mapping[str, Any]) -> EpisodeStore:
         """Of what `read_table` gives."""
         actions, rewards = (_floats(name, found[name]) for name in ("actions", "rewards"))
         costs, several, card = _several(found["costs"], actions.shape[:1], actions.shape[1], found["card"])
@@ -432,7 +433,7 @@ class EpisodeStore:
             schema = TableSchema.of(options)
         elif options:
             raise UserError(f"schema and {next(iter(options))} both say how the table is read; give one of them.")
-        return cls._of_table(read_table(table, schema, notes=notes, card=card))
+        return cls.of_read(read_table(table, schema, notes=notes, card=card))
 
     @classmethod
     def from_layout(
@@ -464,7 +465,7 @@ class EpisodeStore:
         the same entries, bounds and steps, and no episode is in both. Options as of `from_table` or `from_layout`."""
         table, schema = (table, TableSchema.of(options)) if layout is None else read_layout(table, layout, options)
         steps, early = read_parts(table, schema, share, notes=notes, card=card)
-        whole = cls._of_table(steps)
+        whole = cls.of_read(steps)
         if not 0 < early < whole.episodes:
             raise StoreError(
                 f"split={share!r:.60} leaves {early} episodes in front of the cut and {whole.episodes - early} behind "
@@ -476,21 +477,17 @@ class EpisodeStore:
     # --- disk ---
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
-        path = place(path)
-        card = json.dumps(self.card.to_dict())
-        with whole(path) as temporary, arrays.written(temporary) as f:
-            f.attrs["ringfence_store"] = FORMAT
-            f.attrs["card"] = card
-            f.attrs["digest"] = self.content
-            f.attrs["card_digest"] = _digest(card)
-            for name in (*ARRAYS, *OPTIONAL):
-                if getattr(self, name) is not None:
-                    f.create_dataset(name, data=getattr(self, name))
-        return path
+        found = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL)}
+        there = {name: array for name, array in found.items() if array is not None}
+        return write(path, self.card, {k: Pieces(x.shape, x.dtype, [x]) for k, x in there.items()})
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> EpisodeStore:
-        """Read and validate; a foreign, truncated, damaged or invalid file is refused, never read in part."""
+    def load(cls, path: str | os.PathLike, memory: int | None = None, seed: int = 0) -> EpisodeStore:
+        """Read and validate; a foreign, truncated, damaged or invalid file is refused, never read in part.
+
+        Of a store that takes more bytes than `memory`, some episodes are read, at random and half of them with danger,
+        where there are as many; its card's warnings say so. Whether these are what was written is not told then.
+        """
         path = place(path)
         if not path.exists():
             raise StoreError(f"No episode store at '{path}'; make one with `ringfence data make TASK`.")
@@ -506,7 +503,7 @@ class EpisodeStore:
                 raise StoreError(
                     f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
                 )
-            there = _checked(path, f)
+            there = _checked(path, f, memory is None)
             raw = f.attrs["card"]
             digest = f.attrs.get("digest")
             if not isinstance(raw, str | bytes) or len(raw) > 2**24:
@@ -518,16 +515,50 @@ class EpisodeStore:
                     "attribute 'card_digest' if you wrote the card yourself."
                 )
             card = schemas.decode(raw, dict[str, Any])
-            content = {name: array[()] for name, array in there.items()}
+            size = sum(array.nbytes for array in there.values())
+            steps = len(there["actions"])
+            some = _sampled(there, memory * steps // size, seed) if memory is not None and size > memory else None
+            content = {name: array[()] if some is None else some.of(name, array) for name, array in there.items()}
         try:
             found = cls(**content, card=complete_card(card))
         except UserError as error:
             raise StoreError(f"'{path}': {error}") from None
+        if some is not None:
+            said = f"learned from {found.steps:,} of {some.steps:,} steps: {some.words}"
+            return replace(found, card=found.card.updated(warnings=[*found.card.warnings, said]))
         if digest is not None and digest != found.content:
             raise StoreError(
                 f"'{path}' holds other numbers than were written (its digest differs); make or import it again."
             )
         return found
+
+
+class Pieces(NamedTuple):
+    """An array, some rows at a time."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    pieces: Iterable[np.ndarray]
+
+
+def write(path: str | os.PathLike, card: StoreCard, content: Mapping[str, Pieces]) -> Path:
+    """Write the HDF5 file of a store, whole or not at all."""
+    path = place(path)
+    told = json.dumps(card.to_dict())
+    digest = Digest()
+    with whole(path) as temporary, arrays.written(temporary) as f:
+        f.attrs["ringfence_store"] = FORMAT
+        f.attrs["card"] = told
+        f.attrs["card_digest"] = _digest(told)
+        for name, array in content.items():
+            digest.begin(name, array.shape, array.dtype)
+            there, done = f.create_dataset(name, array.shape, array.dtype), 0
+            for piece in array.pieces:
+                there[done : done + len(piece)] = piece
+                digest.add(piece)
+                done += len(piece)
+        f.attrs["digest"] = digest.found
+    return path
 
 
 def _begins_otherwise(path: Path) -> bool:
@@ -538,7 +569,55 @@ def _begins_otherwise(path: Path) -> bool:
     return not HDF5_BEGINS.startswith(begins)
 
 
-def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Some of the episodes of a file."""
+
+    episodes: np.ndarray  # which
+    ends: np.ndarray  # (E,) of all
+    words: str
+
+    @property
+    def steps(self) -> int:
+        return int(self.ends[-1])
+
+    def of(self, name: str, array: h5py.Dataset) -> np.ndarray:
+        """Their rows of an array."""
+        begins = np.concatenate([[0], self.ends[:-1]])
+        if name == "episode_ends":
+            return np.cumsum((self.ends - begins)[self.episodes])
+        more = self.episodes if name in ("observations", "state") else 0
+        last = 1 if name in ("observations", "state") else 0
+        first, after = begins[self.episodes] + more, self.ends[self.episodes] + more + last
+        cut = np.flatnonzero(first[1:] != after[:-1]) + 1  # episodes after one another are read at once
+        spans = zip(first[np.concatenate([[0], cut])], after[np.concatenate([cut - 1, [len(after) - 1]])])
+        return np.concatenate([array[begin:end] for begin, end in spans])
+
+
+def _sampled(there: Mapping[str, h5py.Dataset], steps: int, seed: int) -> _Sample:
+    """Episodes of so many steps at most, and one at least."""
+    ends = there["episode_ends"][()].astype(np.int64)
+    lengths = np.diff(ends, prepend=0)
+    if (lengths <= 0).any() or ends[-1] != len(there["actions"]):
+        raise StoreError("its episode_ends do not increase to the number of its steps; make or import it again")
+    count = max(1, 2**24 // max(1, int(np.prod(there["costs"].shape[1:], dtype=int))))
+    costly = [team(there["costs"][begin : begin + count]) > 0 for begin in range(0, ends[-1], count)]
+    danger = np.logical_or.reduceat(np.concatenate(costly), ends - lengths)
+    order = np.random.default_rng(seed).permutation(len(ends))
+    chosen: list[int] = []
+    left = steps
+    for some, room in ((order[danger[order]], steps // 2), (order[~danger[order]], steps)):
+        taken = some[np.cumsum(lengths[some]) <= min(room, left)]
+        left -= int(lengths[taken].sum())
+        chosen += taken.tolist()
+    rest = order[~np.isin(order, chosen)]
+    chosen += rest[np.cumsum(lengths[rest]) <= left].tolist()
+    kept = np.sort(chosen or [int(order[0])])
+    kinds = [f"{which[kept].sum():,} of {which.sum():,}" for which in (danger, ~danger)]
+    return _Sample(kept, ends, f"{kinds[0]} episodes with danger, and {kinds[1]} others")
+
+
+def _checked(path: Path, f: h5py.File, whole: bool) -> dict[str, h5py.Dataset]:
     """The arrays of a file, looked at before any of them is read: plain ones, in the file itself, of shapes that belong
     together and of no more bytes than the file can hold."""
     missing = [name for name in ARRAYS if name not in f]
@@ -554,7 +633,8 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
                 f"'{path}' holds {array.shape[0]} rows of '{name}' for {steps} steps of {episodes} episodes; make or "
                 "import the store again."
             )
-    arrays.affordable(path, sum(array.nbytes for array in found.values()), PACKED)
+    if whole:
+        arrays.affordable(path, sum(array.nbytes for array in found.values()), PACKED)
     return found
 
 

@@ -32,11 +32,28 @@ def named_arrays(tree: PyTree) -> dict[str, np.ndarray]:
 
 def digest_of(arrays: Iterable[tuple[str, np.ndarray]]) -> str:
     """Of arrays and their names, in this order."""
-    digest = hashlib.blake2b(digest_size=8)
+    digest = Digest()
     for name, array in arrays:
-        digest.update(f"{name} {array.shape} {array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
+        digest.begin(name, array.shape, array.dtype)
+        digest.add(array)
+    return digest.found
+
+
+class Digest:
+    """Of arrays and their names, some rows of each at a time."""
+
+    def __init__(self):
+        self._digest = hashlib.blake2b(digest_size=8)
+
+    def begin(self, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        self._digest.update(f"{name} {shape} {dtype}".encode())
+
+    def add(self, rows: np.ndarray) -> None:
+        self._digest.update(np.ascontiguousarray(rows).data)
+
+    @property
+    def found(self) -> str:
+        return self._digest.hexdigest()
 
 
 def save_named(file: Path, arrays: dict[str, np.ndarray], metadata: Mapping[str, str] | None = None) -> None:

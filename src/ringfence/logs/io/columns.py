@@ -6,7 +6,7 @@ import importlib
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
 from numbers import Number
@@ -27,6 +27,8 @@ LINES = (".jsonl", ".ndjson")
 PARQUET = (".parquet", ".pq")
 KINDS = (".csv", *PARQUET, *LINES, *READERS)
 LONGEST = 1000  # entries of a list
+LINE = 40  # bytes of a row of text, about
+BLOCK = 2**24  # bytes of text that are read at once
 
 
 @dataclass(frozen=True)
@@ -240,6 +242,60 @@ def _read_file(path: Path, wanted: list[str] | None, form: Form) -> Columns:
         return _read_by_arrow(path, wanted, form)
 
 
+def rows_of(path: Path) -> int:
+    """Rows of a file, about as many as its size tells where it does not say how many."""
+    if not path.is_file():
+        return 0
+    if path.suffix.lower() not in PARQUET:
+        return path.stat().st_size // LINE
+    needs("pyarrow")
+    from pyarrow import parquet
+
+    with reading(path, "Parquet file"), parquet.ParquetFile(path) as file:
+        return file.metadata.num_rows
+
+
+def batches(
+    path: Path, wanted: list[str] | None, form: Form, rows: int, numbers: Iterable[str] = ()
+) -> Iterator[Columns]:
+    """The wanted columns of a file, about so many rows at a time; all at once of a kind that is not read by rows.
+    `numbers` are those that are nothing else."""
+    kind = path.suffix.lower()
+    if kind not in (*PARQUET, ".csv") or not path.is_file() or (form.header and kind == ".csv"):
+        yield read_columns(path, names_of(path, form) if wanted is None else wanted, form)
+        return
+    needs("pyarrow")
+    from pyarrow import csv, parquet
+
+    with reading(path, "table that can be read", "write it again"):
+        if kind == ".csv":
+            there = csv.open_csv(path, **_of_csv(path, form)[1]).schema.names
+        else:
+            there = names_in(path)
+        names = there if wanted is None else known(list(dict.fromkeys(wanted)), there)
+        if kind == ".csv":
+            source, how = _of_csv(path, form, numbers, names)
+            read: Iterable[Any] = csv.open_csv(source, **how)
+        else:
+            read = parquet.ParquetFile(path).iter_batches(rows, columns=names)
+        found, count = [], 0
+        for batch in read:
+            found.append(batch)
+            count += batch.num_rows
+            if count >= rows:
+                yield _of_batches(found, names)
+                found, count = [], 0
+        if count:
+            yield _of_batches(found, names)
+
+
+def _of_batches(found: list[Any], names: Sequence[str]) -> Columns:
+    import pyarrow
+
+    table = pyarrow.Table.from_batches(found)
+    return {name: as_numpy(name, table.column(name)) for name in names}
+
+
 def _or(kinds: Iterable[str]) -> str:
     *first, last = kinds
     return f"{', '.join(first)} or {last}"
@@ -261,6 +317,16 @@ def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
 
 def _read_csv(path: Path, form: Form) -> Any:
     """An Arrow table, separated by what separates the first line; by spaces only where the form names the columns."""
+    from pyarrow import csv
+
+    source, options = _of_csv(path, form)
+    return csv.read_csv(source, **options)
+
+
+def _of_csv(
+    path: Path, form: Form, numbers: Iterable[str] = (), wanted: Sequence[str] | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """(what is read, how); `numbers` are columns that are nothing else."""
     import pyarrow
     from pyarrow import csv
 
@@ -274,16 +340,17 @@ def _read_csv(path: Path, form: Form) -> Any:
             separator = "\t" if spaces else separator
             rows = ("\t".join(line.split()) + "\n" if spaces else line for line in (head, *lines))
             source = io.BytesIO("".join(rows).encode())
-    return csv.read_csv(
-        source,
-        read_options=csv.ReadOptions(column_names=list(form.header) or None),
-        parse_options=csv.ParseOptions(delimiter=separator),
-        convert_options=csv.ConvertOptions(
-            column_types={name: pyarrow.string() for name in form.texts},
+    types = {name: pyarrow.float64() for name in numbers} | {name: pyarrow.string() for name in form.texts}
+    return source, {
+        "read_options": csv.ReadOptions(column_names=list(form.header) or None, block_size=BLOCK),
+        "parse_options": csv.ParseOptions(delimiter=separator),
+        "convert_options": csv.ConvertOptions(
+            column_types=types,
             strings_can_be_null=True,
             decimal_point=form.decimal,
+            include_columns=wanted,
         ),
-    )
+    }
 
 
 def _is_number(entry: Any) -> bool:

@@ -86,7 +86,12 @@ LAYOUTS = {
 
 
 def read_table(
-    table: Tables, schema: TableSchema, *, notes: Sequence[str] = (), card: Mapping[str, Any] | None = None
+    table: Tables,
+    schema: TableSchema,
+    *,
+    notes: Sequence[str] = (),
+    card: Mapping[str, Any] | None = None,
+    origins: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """What an `EpisodeStore` is made of, of a table with a row per agent and time, in any order of agents; each
     agent's times increase. Several tables are recordings of their own: no episode is of two, and rows are counted over
@@ -96,7 +101,7 @@ def read_table(
     table. `card` adds fields to it; its `constraints` holds the limits of several costs (0 by default). `StoreError`
     names the first row that cannot be (counted from 0, without a header).
     """
-    return read_parts(table, schema, None, notes=notes, card=card)[0]
+    return read_parts(table, schema, None, notes=notes, card=card, origins=origins)[0]
 
 
 def read_parts(
@@ -106,9 +111,11 @@ def read_parts(
     *,
     notes: Sequence[str] = (),
     card: Mapping[str, Any] | None = None,
+    origins: np.ndarray | None = None,
 ) -> tuple[dict[str, Any], int]:
     """The same, and how many of the episodes are of the first `share` of the time: these come first, and none is of
-    both parts. Without a share, all of the time is one part."""
+    both parts. Without a share, all of the time is one part. `origins` (D,) are taken from entries; by default, what
+    they tell."""
     of_kind("card", card, Mapping | None, "give a dictionary of its fields")
     of_kind("notes", notes, Sequence, "give a list of sentences")
     columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])
@@ -133,7 +140,7 @@ def read_parts(
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
     warnings = [*notes, *metres, *angles, *repeated, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
-    return _arrays(motion, episodes, warnings, card or {}, lost), int(early.sum())
+    return _arrays(motion, episodes, warnings, card or {}, lost, origins), int(early.sum())
 
 
 def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
@@ -284,7 +291,12 @@ def _made_of(schema: TableSchema) -> Iterator[str]:
 
 
 def _arrays(
-    motion: Motion, episodes: Episodes, warnings: list[str], card: Mapping[str, Any], lost: bool
+    motion: Motion,
+    episodes: Episodes,
+    warnings: list[str],
+    card: Mapping[str, Any],
+    lost: bool,
+    origins: np.ndarray | None,
 ) -> dict[str, Any]:
     """What an `EpisodeStore` is made of. What the table has `lost` is not found again by moving it."""
     schema = motion.schema
@@ -321,8 +333,9 @@ def _arrays(
     named = len(schema.cost) > 1
     ends = np.cumsum(episodes.lengths - 1)
     rows = looked_at(ends)
-    origins = None
-    if not lost and not card.get("observation_origins"):
+    if origins is not None:
+        origins = origins if origins.any() else None
+    elif not lost and not card.get("observation_origins"):
         before, after = (episodes.seen(episodes.rows[each]) for each in (rows, rows + 1))
         origins = origins_of({"observations": (before, after)}).get("observations")
     return {
