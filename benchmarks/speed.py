@@ -9,6 +9,8 @@ actor_critic  updates/s of ma-td3bc and omar; a PyTorch loop over agents was mea
 planning      an update of the planner, and one joint action under guards, as teams grow; untrained networks
 guard         fitting a World, and one joint action of a clone under guards
 crossing      the same of Crossing, 8, 64 and 256 agents who guard themselves
+causes        the search for causes in 200,000 steps of six agents
+tables        ten million rows of a table as a store
 startup       until a command is done and a controller acts, with programs kept from an earlier process and without
 proof         one joint action of Crossing with a proof and without, to results/stress/proof.json
 board         plan_ms_p50 and plan_ms_p99 of results.json of seed 0 of a board's first task, where its checkpoints are
@@ -267,6 +269,44 @@ def causes(rows: Rows, brief: bool) -> None:
         )
 
 
+IMPORT = """
+import json, resource, sys, time
+from pathlib import Path
+from ringfence.logs.large import import_large
+begun = time.process_time()
+options = dict(time="time", agent="id", state=["x", "y"], cost=("hit",), quiet=True)
+made = import_large([Path(sys.argv[1])], Path(sys.argv[2]), **options)
+print(json.dumps([time.process_time() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, made.steps]))
+"""
+
+
+def tables(rows: Rows, brief: bool) -> None:
+    """A Parquet table of ten who drive about, who are in episodes of 500 steps, as a store."""
+    import pyarrow
+    from pyarrow import parquet
+
+    agents, block = 10, 100_000
+    steps = 100_000 if brief else 1_000_000
+    pace, phase = np.linspace(0.5, 1.5, agents), np.random.default_rng(0).uniform(0, 6, agents)
+    with tempfile.TemporaryDirectory() as folder:
+        file, writer = Path(folder) / "fleet.parquet", None
+        for begin in range(0, steps, block):
+            t = np.arange(begin, begin + block)
+            turned = t[:, None] * 0.01 * pace + phase
+            place = 10 * np.stack([np.cos(turned), np.sin(0.8 * turned)], -1)
+            hit = np.repeat(np.abs(place[..., 0]).min(1) < 0.01, agents)
+            times = np.repeat(t * 0.1 + t // 500 * 100.0, agents)
+            columns = {"time": times, "id": np.tile(np.arange(agents), len(t)), "hit": hit.astype(float)}
+            table = pyarrow.table(columns | dict(zip("xy", place.reshape(-1, 2).T)))
+            writer = writer or parquet.ParquetWriter(file, table.schema)
+            writer.write_table(table)
+        assert writer is not None
+        writer.close()
+        took, peak, made = in_a_process(IMPORT, str(file), str(Path(folder) / "fleet.h5"))
+    rows(f"table of {steps * agents:,} rows, {made:,} steps of {agents} agents", took, "s of CPU")
+    rows(f"table of {steps * agents:,} rows: peak resident memory", peak, "GiB")
+
+
 def actor_critic(rows: Rows, brief: bool) -> None:
     """Three agents, batch 1024, two layers of 64, on one core, as the grid's workers run."""
     store, _ = make(registry.get("simple_spread-expert"))
@@ -487,6 +527,7 @@ GROUPS: dict[str, Callable[[Rows, bool], None]] = {
     "crossing": crossing,
     "startup": startup,
     "causes": causes,
+    "tables": tables,
 }
 
 if __name__ == "__main__":
