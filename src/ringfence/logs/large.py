@@ -93,6 +93,10 @@ class _Table:
         others = tuple(name for name in named if name not in (time, agent, episode))
         return cls(None, options, time, episode, named, form, schema.time_format, others)
 
+    def when(self, columns: Columns) -> np.ndarray:
+        """(M,) times of rows."""
+        return dates(columns[self.time], self.time_format)
+
     def store(self, tables: list[Columns], card: Mapping[str, Any], first: StoreCard | None) -> EpisodeStore:
         """The store of a part, in steps, teams and origins as in the first one."""
         found: Any = tables
@@ -142,14 +146,12 @@ def _of_file(file: Path, table: _Table, rows: int) -> Iterator[_Part]:
     """Rows of a table. A recording that ends within them is not cut; of a longer one, the last rows begin the next
     part, too."""
     held: Columns = {}
-    reached, step, done = None, None, 0
+    reached, done = None, 0
     over: set[str] = set()
-    for batch, is_last in _with_last(batches(file, table.wanted, table.form, rows, table.numbers), rows):
+    for batch, following in _with_next(batches(file, table.wanted, table.form, rows, table.numbers), rows):
         new = len(batch[table.time])
-        if held and _away(held[table.time], batch[table.time], table.time_format, step):
-            held = {}
         part = {k: np.concatenate([held[k], column]) if held else column for k, column in batch.items()}
-        when = dates(part[table.time], table.time_format)
+        when = table.when(part)
         whose = np.zeros(len(when), int) if table.episode is None else words(part, table.episode)
         name = f"rows {done:,} to {done + new - 1:,} of '{file}'"
         goes_on = when[-new:][whose[-new:] == whose[0]]
@@ -159,38 +161,34 @@ def _of_file(file: Path, table: _Table, rows: int) -> Iterator[_Part]:
                 "sort it by recording and time, or give a file for each recording."
             )
         done += new
-        of_last = whose == whose[-1]
-        if is_last:
-            kept, later = np.ones(len(when), bool), np.zeros(len(when), bool)
-        elif of_last.all():  # of the last time there may be more rows
-            times = np.unique(when)
-            reached, step = times[-min(2, len(times))], np.median(np.diff(times))
-            kept, later = when < times[-1], when >= reached
-        else:
-            reached = None
-            kept, later = ~of_last, of_last
+        kept, later = np.ones(len(when), bool), np.zeros(len(when), bool)
+        reached = None
+        if following and (whose != whose[-1]).any():
+            later = whose == whose[-1]
+            kept = ~later
             over |= set(whose[kept].tolist())
+        elif following:
+            times = np.unique(when)
+            reached = times[-1]
+            if table.when(following).min() - reached <= GAP * np.median(np.diff(times)):  # of the last time may be more
+                reached = times[-min(2, len(times))]
+                kept, later = when < times[-1], when >= reached
         yield _Part(name, [{k: column[kept] for k, column in part.items()}], int(kept.sum()))
-        held = {k: column[later] for k, column in part.items()}
+        held = {k: column[later] for k, column in part.items()} if later.any() else {}
 
 
-def _away(held: np.ndarray, new: np.ndarray, time_format: str | None, step: Any) -> bool:
-    """Whether so long lies between rows that nothing goes on."""
-    return step is not None and dates(new, time_format).min() - dates(held, time_format).max() > GAP * step
-
-
-def _with_last(read: Iterator[Columns], rows: int) -> Iterator[tuple[Columns, bool]]:
-    """What is read, and whether it is the last; few rows at the end are read with what is before them."""
+def _with_next(read: Iterator[Columns], rows: int) -> Iterator[tuple[Columns, Columns]]:
+    """What is read, and what comes next; few rows at the end are read with what is before them."""
     before: Columns = {}
     for batch in read:
         if before and len(next(iter(batch.values()))) < rows // 2:
             before = {k: np.concatenate([before[k], column]) for k, column in batch.items()}
             continue
         if before:
-            yield before, False
+            yield before, batch
         before = batch
     if before:
-        yield before, True
+        yield before, {}
 
 
 class Written(NamedTuple):
