@@ -987,14 +987,17 @@ def test_a_guard_looks_as_far_as_the_card_asks(fitted):
     assert seen(3, (0.1, 0.9, 0.9), 0.1) == {}, "three rows see nearly all"
     assert seen(10, (0.1, 0.4, 0.9), 0.8) == {}, "rows that are predicted badly see nothing"
 
-    def foreseen(*errors, wide=((0.0,), (0.0,))):
+    def foreseen(*errors, wide=((0.0,), (0.0,)), late=None):
         read = [Foresight(str(error), (4, 10, 20), error, error, 1.0) for error in errors]
         error = PredictionError(steps_ahead=(8,), error_of_change=(0.8,), by_entry={}, read=tuple(read))
-        card = Card(data=Data("walks", {}), barrier=BarrierScores(widening=wide), prediction_error=error)
-        return asked(card).get("horizon")
+        barrier = BarrierScores(widening=wide, avoidable=late)
+        return asked(Card(data=Data("walks", {}), barrier=barrier, prediction_error=error)).get("horizon")
 
     assert foreseen((0.1, 0.1, 0.2), (0.0, 0.1, 0.3)) == 15
     assert foreseen((0.1, 0.1, 0.2), (0.0, 0.1, 0.4)) == 10, "as far as all that is read is foreseen"
     assert foreseen((0.1, 0.5, 0.6)) == 4
     assert foreseen((0.4, 0.5, 0.6)) is None
+    sums, soon = (Avoidable((3, 15, 30), (0.0, share, 1.0), 30) for share in (0.3, 0.6))
+    assert foreseen((0.1, 0.1, 0.2), late=sums) == 30, "a dose adds up, and is avoided long before"
+    assert foreseen((0.1, 0.1, 0.2), late=soon) == 15 and foreseen((0.1, 0.1, 0.4), late=sums) == 10
     assert foreseen((0.1, 0.1, 0.2), wide=()) is None, "Worlds of before do not say what rows ahead ask for"

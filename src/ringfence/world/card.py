@@ -354,7 +354,7 @@ def _of_barrier(card: Card) -> Iterator[str]:
             f"unsafe; {percent(row.safe_kept, 3)} of the safe steps have it"
         )
     if scores.avoidable is not None:
-        yield _of_horizon(scores.avoidable, scores.ahead_kept)
+        yield _of_horizon(scores.avoidable, scores.ahead_kept, card.look or Look())
     if not math.isnan(scores.searched):
         yield (
             "A guard that searches for actions, where drivers want anything, finds some that keep the margin; of the "
@@ -400,9 +400,9 @@ def _edge(cause: Cause, edge: Edge) -> str:
     return f", {'below' if edge.below else 'above'} {edge.at:.3g}"
 
 
-def _of_horizon(avoidable: Avoidable, kept: float) -> str:
+def _of_horizon(avoidable: Avoidable, kept: float, look: Look) -> str:
     shares = ", ".join(f"{percent(s, 3)} at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
-    far = f"; guards look up to {FARTHEST} ahead by themselves" if avoidable.rows > FARTHEST else ""
+    far = f"; guards look up to {FARTHEST} ahead by themselves" if avoidable.rows > max(FARTHEST, look.rows) else ""
     line = (
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
         f"{avoidable.rows} ahead (horizon={avoidable.rows}{far}), where predictions reach that far"

@@ -25,6 +25,8 @@ AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could 
 NOTHING = 1.0  # error of predictions as a share of what changes: to predict that nothing changes errs by as much
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
 LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V sees in time what they do not
+HALF = 0.5  # likewise, of what the farthest look avoids that is usual
+FOR_ONCE = 30  # rows of a look that is farther than that
 BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
 # and causes that read it are known ahead: with rays, of which 53 % and 87 % are not, guards left 33 to 52 % of episodes
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
@@ -215,6 +217,10 @@ def look_of(card: Card) -> Look:
     """What a guard is to look at, where a World is as its card says."""
     rows = _rows_foreseen_well(card)
     scores = card.barrier
+    if rows == FARTHEST and scores is not None and scores.avoidable is not None:
+        avoidable = scores.avoidable
+        if _share_within(avoidable, FARTHEST) < HALF * max(avoidable.avoided):  # what adds up takes long to avoid
+            rows = min(avoidable.rows, FOR_ONCE)
     if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
         return Look(rows)
     error = card.prediction_error
@@ -236,5 +242,9 @@ def _rows_foreseen_well(card: Card) -> int:
 def _too_late(avoidable: Avoidable) -> bool:
     """Whether the rows that a guard judges avoid little of the danger that could have been avoided, e.g. where braking
     takes longer."""
-    seen = [share for before, share in zip(avoidable.before, avoidable.avoided) if before <= JUDGED]
-    return max(seen, default=0.0) < LITTLE * max(avoidable.avoided)
+    return _share_within(avoidable, JUDGED) < LITTLE * max(avoidable.avoided)
+
+
+def _share_within(avoidable: Avoidable, rows: int) -> float:
+    """Of danger that could still be avoided so many rows ahead."""
+    return max((s for before, s in zip(avoidable.before, avoidable.avoided) if before <= rows), default=0.0)
