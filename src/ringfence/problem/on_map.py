@@ -21,6 +21,7 @@ FIRST = 8  # of the rows that are compared, by which most entries are told apart
 DISTINCT = 0.2  # of the rows: what takes fewer values is a flag or a count, and alike by chance
 LEAP = 0.5  # of the range: what changes by more in a step begins again, as angles do
 ALIKE = 0.5  # correlation of what changes along with one's own place
+SOMEBODY = 0.5  # of the rows, in which what is listed is of one of the team
 SPREAD = 0.1  # of the range of one's own place: by less nothing varies that is on the same map
 MINE = re.compile(r"(?:(?:own|ego|self|me|agent|robot|pos|position|p)[._]?)?([xyz])")
 SPEEDS = ("v", "dv", "vel", "velocity", "speed")
@@ -129,7 +130,10 @@ def relative(
     of_others = _of_others(steps, free, names)
     columns = columns.less(of_others)
     found = called(columns)
-    if joined is not None and len(columns.plus) > 1 and not Entries.of(found).others:
+    listed = _listed(steps, found) if joined is not None else []
+    if listed:
+        columns = replace(columns, names=tuple(re.sub(r"^other(\d+\.)", r"listed\1", name) for name in columns.names))
+    if joined is not None and len(columns.plus) > 1 and (listed or not Entries.of(found).others):
         seen = free if joined[1] is not None else list(_own_axes(steps, free, found).values())
         columns = columns.with_others(_of_state(steps, seen, names, joined, keep))
         found = called(columns)
@@ -139,7 +143,13 @@ def relative(
     if of_things:
         columns = columns.less(of_things)
         found = _with_things(called(columns), names, of_things, own)
-    return replace(columns, names=found)
+    columns = replace(columns, names=found)
+    if not listed or not Entries.of(found).others:
+        return columns
+    kept = [c for c in range(len(found)) if c not in listed]
+    return replace(
+        columns, plus=columns.plus[:, kept], minus=columns.minus[:, kept], names=tuple(found[c] for c in kept)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +188,26 @@ class _Steps(Steps):
         """Whether all see the same there, e.g. what time it is."""
         seen = self.before[..., entry]
         return bool((np.ptp(seen, axis=1) <= EXACT * self.deviation[entry]).mean() > 1 - SHARE)
+
+
+def _listed(steps: _Steps, found: Sequence[str]) -> list[int]:
+    """Entries that tell how far some of the team are whose places in a list change, as the nearest do, and that follow
+    from where everybody is."""
+    known = Entries.of(found)
+    own = {e.what: e.source for e in known.each if e.whose == "own"}
+    told = [e for e in known.each if e.whose == "other" and e.role in ("offset", "drift") and e.what[1:] in own]
+    x = steps.before
+    agents = x.shape[1]
+    moves = False
+    for e in told:
+        mine = own[e.what[1:]]
+        gap = x[:, None, :, mine] - x[:, :, None, mine]  # (W, N, N) of each to all
+        near = np.abs(x[:, :, None, e.source] - gap) <= EXACT * steps.deviation[mine]
+        near &= ~np.eye(agents, dtype=bool)
+        if near.any(2).mean() < SOMEBODY:
+            return []
+        moves |= bool((near.mean(0).max(1) < SHARE).any())  # of some agent it is nobody's in particular
+    return [e.source for e in told] if moves else []
 
 
 def _of_others(steps: _Steps, free: Sequence[int], names: Sequence[str]) -> dict[int, int]:

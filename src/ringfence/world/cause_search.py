@@ -18,7 +18,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.cause_candidates import beside, candidates, of_several, of_team, pairs, wider
+from ringfence.problem.entries import Entries
+from ringfence.world.cause_candidates import beside, candidates, of_several, of_team, offsets, pairs, wider
 from ringfence.world.cause_counts import (
     Counted,
     Explained,
@@ -32,7 +33,7 @@ from ringfence.world.cause_counts import (
 )
 from ringfence.world.causes import Cause, Edge, Found, narrowed, only_of, only_where
 from ringfence.world.cells import CELLS, Cells
-from ringfence.world.quantities import Entry, Length, Over, Quantity
+from ringfence.world.quantities import Entry, Length, Over, Quantity, leaves
 from ringfence.world.rules import rules_of, tilted_of, weighted_of
 
 MOST = 8  # causes
@@ -59,7 +60,7 @@ def find(
     chosen = _with_more_shapes(steps, _split(steps, _best_grown(steps, names), names), names, team)
     if not chosen:
         return Found(searched=True), []
-    chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
+    chosen = _foreseen(steps, [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen], names)
     edges = [refined(steps, one.cells.edge, one.cause, _without(steps, chosen, one)) for one in chosen]
     alike = _siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
     chosen += [one for one, _ in alike]
@@ -69,6 +70,21 @@ def find(
     chosen, called = [chosen[k] for k in kept], [called[k] for k in kept]
     edges = [edges[k] for k in kept]
     return replace(_summary(steps, chosen, called), edges=tuple(edges), searched=True), [one.cells for one in chosen]
+
+
+def _foreseen(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
+    """The causes, how far others are in the place of what sensors see of them, where it tells as much: how bodies move
+    is foreseen better than ranges are."""
+    for k, one in enumerate(chosen):
+        if one.cause.width > 1 or Entries.of([leaf.name for leaf in leaves(one.cause.reads[0])]).each:
+            continue
+        explained = _without(steps, chosen, one)
+        far = [counted(steps, cause, explained) for cause in _about_whom(steps, offsets(names))]
+        wrong = [_told_wrong(steps, other, explained) for other in far]
+        most = _told_wrong(steps, one, explained) + NEEDLESS * steps.unsafe.sum()
+        if far and min(wrong) <= most:
+            chosen = [*chosen[:k], far[int(np.argmin(wrong))], *chosen[k + 1 :]]
+    return chosen
 
 
 def _needed(steps: Steps, called: list[np.ndarray]) -> list[int]:
