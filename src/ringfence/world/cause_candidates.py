@@ -68,7 +68,8 @@ def pairs(names: Sequence[str]) -> Iterator[Cause]:
 
 def of_several(names: Sequence[str]) -> Iterator[Cause]:
     """How far away the nearest of several things is, the second nearest, and so on: who is crowded, or alone; how far
-    the middle of all is; and of oneself and two of them, how far apart all three are, and what area lies between."""
+    the middle of all is; and of oneself and two of them, how far apart all three are, what area lies between, and at
+    what angle one sees both."""
     for cause in offsets(names):
         count = cause.things
         offset = cause.reads[0].parts
@@ -89,6 +90,7 @@ def _of_three(offset: tuple[Entry, ...]) -> Iterator[Cause]:
     yield Cause((All((Length(tuple(one)), Length(tuple(two)), between)),))
     if len(offset) == 2:
         yield Cause((Length((Sum((Product((one[0], two[1])), Product((one[1], two[0]))), (0.5, -0.5)),)),))
+        yield Cause((Turned((one[0], one[1]), tuple(two), "angle"),))
 
 
 def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:

@@ -44,6 +44,7 @@ NEEDED = 2.0  # standard errors, by which one that is kept beside all others has
 PURE = 0.8  # share of the steps that a cause calls unsafe, and that are, of one that is no mixture of others
 ENOUGH = 0.98  # share of unsafe steps, and of safe ones, that causes tell, from which on nothing else is tried
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
+LIKELY = 12  # causes, those that tell most of all agents, that may hold for some alone
 FEW = 6  # episodes with danger, below which anything is
 ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too
 SLANTED = 0.2  # share of the steps told wrongly that a threshold which depends on others has to tell rightly
@@ -121,7 +122,12 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str],
         return chosen
     several = [one for one in _about_whom(steps, of_several(names)) if _is_of_several(steps, one)]
     shapes = [*_about_whom(steps, pairs(names)), *several, *(_about_whom(steps, of_team(names)) if team else ())]
-    found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
+    pool = [*_about_whom(steps, candidates(names)), *shapes]
+    found = _added(steps, [], pool)
+    if not _tell_enough(steps, found):  # some may hold for some agents alone
+        nothing = Explained.by(steps, [])
+        likely = sorted(shapes, key=lambda cause: -counted(steps, cause, nothing).gain)[:LIKELY]
+        found = _added(steps, found, [one for cause in likely for one in only_of(cause, steps.x.shape[1])], PURE)
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
     chosen = _as_rules(steps, chosen, shapes, names)
     found = _as_rules(steps, found, shapes, names)

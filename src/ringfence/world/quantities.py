@@ -109,7 +109,9 @@ class Turned(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def words(self) -> str:
-        kind = _thing_at([part.words for part in self.offset])
+        kind, other = (_thing_at([part.words for part in vector]) for vector in (self.offset, self.direction))
+        if other.startswith("another "):
+            return f"angle between {kind} and {other}"
         return f"angle to {kind}" if self.what == "angle" else f"{kind}.{self.what}"
 
 

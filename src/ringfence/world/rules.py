@@ -12,7 +12,7 @@ import numpy as np
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
 from ringfence.world.causes import Cause
 from ringfence.world.cells import VISITED, Cells
-from ringfence.world.quantities import All, Entry, Over, Quantity, Sum
+from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
@@ -107,7 +107,8 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
         new = Sum((*old.parts, *terms), (*old.weights, *weights), float((old.more or 0.0) - at))
         numbers = whole.of_quantities(terms)
         alone = replace(whole, values=np.zeros_like(whole.values)).best(numbers, found)
-        if alone[0] <= whole.best(numbers, found)[0] + NEEDLESS * whole.bad.sum():  # nothing is left of the old one
+        needless = alone[0] <= whole.best(numbers, found)[0] + NEEDLESS * whole.bad.sum()
+        if needless and max(map(how_many, [*terms, *conditions[:k], *conditions[k + 1 :]])) == one.cause.things:
             unit = float(whole.values.std() / max((numbers @ found).std(), 1e-9))
             new = Sum(tuple(terms), tuple(unit * w for w in weights), -unit * alone[1])
         parts = _settled(read, one.cause, (*conditions[:k], new, *conditions[k + 1 :]))
