@@ -1,14 +1,13 @@
 """What the documents claim: sentences by page, each with the check behind it, which names the file it rests on and says
 what it found. Fails when one does not hold, or when its words are no longer there.
 
-    python benchmarks/claims.py          # prints docs/claims.md's table into it
+    python benchmarks/claims.py
 """
 
 from __future__ import annotations
 
 import re
 import sys
-import textwrap
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 import planner_tables
 import pooled
 from ablations import adjusted
-from common import RESULTS, ROOT, of_json, put, read
+from common import RESULTS, ROOT, of_json, read
 from evidence import LEVEL, difference, evaluations, mean, of, proven, tasks_of, variant
 from guards_tables import FULL, SHIELD, answers
 from scipy.stats import fisher_exact, spearmanr
@@ -32,11 +31,10 @@ POOL, MEDIUM, RANDOM = (f"pooled/simple_spread-{tier}-pooled.json" for tier in (
 BOTH_POOLS = "pooled/simple_spread-{medium,random}-pooled.json"
 ROBOTS = "guards-mujoco"
 BARRIERS = ("learned", "analytic")
-SHOWN = 80  # letters of a sentence in the table
 
 
 def on(file: str) -> Callable[[Check], Check]:
-    """The file of `results/` that a check rests on, as the page names it."""
+    """The file of `results/` that a check rests on."""
 
     def mark(check: Check) -> Check:
         check.__dict__["file"] = file
@@ -914,20 +912,16 @@ CLAIMS: dict[str, dict[str, Check]] = {
 
 
 def main() -> None:
-    lines, wrong = ["| claim | rests on | found |", "|---|---|---|"], 0
+    wrong = 0
     for page, claims in CLAIMS.items():
         text = re.sub(r"\s+", " ", (ROOT / page).read_text())
-        lines.append(f"| **{page}** | | |")
         for words, check in claims.items():
             holds, found = check()
             if words not in text:
                 holds, found = False, "the sentence is not there"
             wrong += not holds
-            print(f"{'ok   ' if holds else 'WRONG'} {page}: {words}: {found}")
-            short = textwrap.shorten(words, SHOWN, placeholder=" …")
             file = check.__dict__["file"].removeprefix("results/")
-            lines.append(f"| {short} | {file} | {'' if holds else '**wrong**: '}{found} |")
-    put("docs/claims.md", "claims", "\n".join(lines))
+            print(f"{'ok   ' if holds else 'WRONG'} {page}: {words} ({file}): {found}")
     sys.exit(f"{wrong} claims do not hold" if wrong else 0)
 
 

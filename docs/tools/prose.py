@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-LEFT_OUT = ("history", "claims")  # what failed, by date; and a table of sentences
 GOAL = 18  # words a sentence, in the mean of a page
 LIMIT = 20
 LONGEST = 120  # words of a paragraph
@@ -170,7 +169,7 @@ def pages(root: Path = ROOT) -> dict[str, Path]:
     found = {"README": root / "README.md"}
     found |= {"index" if f.stem == "README" else f.stem: f for f in sorted((root / "docs").glob("*.md"))}
     found |= {f.stem: f for f in sorted((root / "examples").glob("*.ipynb"))}
-    return {name: file for name, file in found.items() if name not in LEFT_OUT}
+    return found
 
 
 def measure(file: Path, root: Path = ROOT) -> Measured:
