@@ -167,7 +167,7 @@ class Measured(NamedTuple):
 def pages(root: Path = ROOT) -> dict[str, Path]:
     """By the name that `--pages` takes."""
     found = {"README": root / "README.md"}
-    found |= {"index" if f.stem == "README" else f.stem: f for f in sorted((root / "docs").glob("*.md"))}
+    found |= {f.stem: f for f in sorted((root / "docs").glob("*.md"))}
     found |= {f.stem: f for f in sorted((root / "examples").glob("*.ipynb"))}
     return found
 
