@@ -926,7 +926,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "predicted step or three is as safe as ℓ along seven": as_safe_by_v,
         "`full` earns a quarter more than the shield, without contact": full_is_safe,
         "a return-conditioned clone earns 4.96 under the same shield": told_clones_earn,
-        "the shield leaves contact in 1 of 10,000 episodes": crossing_rare,
+        "On eight tiers the shield leaves contact in 1 of 10,000 episodes": crossing_rare,
         "Whoever does not start in contact touches nobody in any size": no_size_touches,
         "the shield takes hardly any return": no_size_loses,
         # other simulators and constraints

@@ -26,7 +26,6 @@ CROSSED: dict[str, tuple[str, Row]] = {
     "logs": ("guards", ("behaviour data", "reference")),
     "do nothing": ("guards", ("do-nothing", "reference")),
     "BC": ("guards", ("bc", "default")),
-    "10 % BC": ("guards", ("bc-best", "default")),
     "return-conditioned BC": ("guards", ("bc-return", "default")),
     "MA-TD3+BC": ("guards", ("ma-td3bc", "default")),
     "MA-TD3+BC, Lagrange": ("guards", ("ma-td3bc-lag", "default")),
@@ -34,7 +33,6 @@ CROSSED: dict[str, tuple[str, Row]] = {
     "MA-CQL": ("simple_spread", ("ma-cql", "default")),
     "FISOR per agent": ("simple_spread", ("fisor", "default")),
     # guards other than the shield that learned
-    "BC under shield, *analytic*": ("guards", ("bc", "default+shield-analytic")),
     "BC under `full`": ("guards", ("bc", f"default{FULL}")),
     "MPC from a zero proposal (`mpc`) under `full`": ("guards", ("mpc", f"default{FULL}")),
     "BC under shield, decentralized": ("own-sight", ("bc", f"default{SHIELD}-decentralized")),

@@ -86,7 +86,8 @@ LEARNED = ("simple_spread-expert", "simple_spread-expert-pooled")
 
 
 def changes() -> str:
-    """A line for each change of the planner: return less that of *as it is*, by the same seeds on the same resets."""
+    """A line for each change of the planner that differs beyond chance: return less that of *as it is*, by the same
+    seeds on the same resets."""
     found = {task: rows_of("ablations", task) for task in LEARNED}
     lines = []
     for name in dict.fromkeys(r["name"] for rows in found.values() for r in rows):
@@ -94,7 +95,8 @@ def changes() -> str:
         for task, rows in found.items():
             mine, usual = (played(rows, one, "alone") for one in (name, "as it is"))
             cells.append(brief(mine) if name == "as it is" else less(mine, usual, task) if mine else "–")
-        lines.append((name, *cells))
+        if name == "as it is" or any("**" in cell for cell in cells):
+            lines.append((name.partition(" (")[0], *cells))
     return markdown(("`madiff`", *(task.removeprefix("simple_spread-") for task in LEARNED)), lines)
 
 

@@ -86,6 +86,7 @@ REFERENCE = {
         "ringfence.guards.wrap",
     ),
     "Planners": ("ringfence.proposals.planner",),
+    "Options": ("ringfence.guards.options", "ringfence.proposals.options"),
     "Algorithms": (
         "ringfence.types",
         "ringfence.algos",
