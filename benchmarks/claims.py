@@ -968,7 +968,8 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "Fourteen of sixteen guarded clones violate in at most 1 % of their episodes": of_systems,
         "On twelve systems the guard leaves it at most 2 %, at nine tenths of the oracle's return; a guard "
         "that looks three steps ahead on eight": of_bad_driving,
-        "Naive drivers under guards of *fit* Worlds violate on `bench`, `convoy`, `flock` and `gears`": of_fit_worlds,
+        "Naive drivers under guards of *fit* Worlds violate on `bench`, `convoy`, `flock` and `gears`**, by one seed "
+        "in up to 35 %": of_fit_worlds,
         "With naive drivers it leaves more violations than the shield on eight of thirteen systems, fewer on "
         "three": of_filters,
         "Nine of ten guarded clones never violate": of_ten_more,

@@ -53,7 +53,6 @@ ON_ROBOTS: dict[str, tuple[str, Row]] = {
     "BC under `full`": ("guards-mujoco", ("bc", f"default{FULL}")),
     "BC under `full`, *analytic*": ("guards-mujoco", ("bc", "default+full-analytic")),
     "BC under `adapt`, decentralized": ("own-sight-mujoco", ("bc", f"default{ADAPT}-decentralized")),
-    "return-conditioned BC under `adapt`": ("guards-mujoco", ("bc-return", f"default{ADAPT}")),
     "MPC from a zero proposal under `full`": ("guards-mujoco", ("mpc", f"default{FULL}")),
 }
 # Crossing's rows: algorithm and variant, and their words.
@@ -61,12 +60,10 @@ WAYS: dict[str, Row] = {
     "certificates (true state and brakes)": ("certificates", "reference"),
     "BC": ("bc", "default"),
     **{
-        f"shield, ℓ, {k} step{'s' * (k > 1)}": ("bc", f"default{SHIELD}+horizon{k}+terminal_valueFalse")
-        for k in (1, 3, 7)
+        f"shield, ℓ, {k} step{'s' * (k > 1)}": ("bc", f"default{SHIELD}+horizon{k}+terminal_valueFalse") for k in (1, 7)
     },
     "shield, ℓ and V, 1 step": ("bc", f"default{SHIELD}+horizon1"),
     "**shield, ℓ and V, 3 steps**": ("bc", f"default{SHIELD}"),
-    "shield, analytic, 15 steps": ("bc", "default+shield-analytic+horizon15+terminal_valueFalse"),
     "return-conditioned BC, shield": ("bc-return", f"default{SHIELD}"),
     "**full**": ("bc", f"default{FULL}"),
 }

@@ -233,10 +233,17 @@ def of_pools() -> str:
 
 
 def zoo() -> str:
-    lines = []
+    """A line per policy: return / cost, alone and under its guard."""
+    rows: dict[str, list[dict[str, str]]] = defaultdict(list)
     for r in read("zoo.csv"):
-        lines.append((r["policy"], r["guard"], r["return"], r["cost"]))
-    return markdown(("policy", "guard", "return", "cost"), lines)
+        rows[r["policy"]].append(r)
+    lines = []
+    for policy, found in rows.items():
+        guard = next(r["guard"] for r in found if r["guard"] != "none")
+        found.sort(key=lambda r: r["guard"] != "none")
+        cells = [f"{float(r['return']):.4g} / {float(r['cost']):.3g}" for r in found]
+        lines.append((policy, *cells, f"`{guard}`"))
+    return markdown(("policy", "alone", "guarded", "guard"), lines)
 
 
 def export() -> str:
@@ -272,18 +279,18 @@ def ranks() -> str:
             x, y = (np.array([float(r[k]) for r in rows if r["task"] == name]) for k in (number, truth))
             rank = spearmanr(x, y).statistic
             cells.append("–" if np.isnan(rank) else f"{rank:.2f}")
-        lines.append((words, "cost" if truth == "true_cost" else "return", *cells))
+        lines.append((words, *cells))
     heads = [f"{name} ({sum(r['task'] == name for r in rows)} rows)" for name in names]
-    return markdown(("number", "is to rank", *heads), lines)
+    return markdown(("number", *heads), lines)
 
 
 def of_hostile() -> str:
-    """The four ways to fail are one column of the page, since all are to be 0."""
+    """All kinds of files together; what may go wrong is one column, since all of it is to be 0."""
     rows = read("hostile.csv")
     good = ("files", "tried", "refused", "read, unchanged")
     failures = [k for k in rows[0] if k not in (*good, "MiB more")]
-    lines = [(r["files"], r["tried"], r["refused"], sum(int(r[k]) for k in failures)) for r in rows]
-    return markdown(("files", "tried", "refused", "anything else"), lines)
+    counts = [sum(int(r[k]) for r in rows) for k in good[1:]] + [sum(int(r[k]) for r in rows for k in failures)]
+    return markdown(("kinds", *good[1:], "anything else"), [(len(rows), *counts)])
 
 
 def of_public_sets() -> str:

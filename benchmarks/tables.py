@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import defaultdict
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import evidence
 import guards_tables
@@ -22,11 +20,6 @@ import study_tables
 from common import RESULTS, markdown, of_json, put
 from evidence import proven
 
-from ringfence import algos
-from ringfence.bench import unpack
-from ringfence.datasets import registry
-from ringfence.utils.config import build_config
-
 # What the page of speeds shows of the measurements, and its words.
 SHOWN = {
     "simple_spread-expert: cloning, guard shield, one joint action": "Simple Spread: an action under `shield`",
@@ -35,11 +28,9 @@ SHOWN = {
     "halfcheetah_2x3-medium: cloning, guard full, one joint action": "HalfCheetah: under `full`",
     "Crossing: one joint action, guard shield, 8 agents": "Crossing, 8 agents: under `shield`",
     "Crossing: one joint action, guard shield, 256 agents": "Crossing, 256 agents: under `shield`",
-    "Crossing: one joint action, guard full, 8 agents": "Crossing, 8 agents: under `full`",
     "simple_spread-expert: fitting a World": "Simple Spread: a World",
     "Crossing: fitting a World": "Crossing: a World",
     "peak memory of this benchmark": "memory of the largest",
-    "data make halfcheetah_2x3-good, 1,000,000 transitions": "HalfCheetah: a million logged steps",
     "ma-td3bc, over the loop, one core": "`ma-td3bc` beside a PyTorch loop",
     "omar, over the loop, one core": "`omar` beside a PyTorch loop",
 }
@@ -115,48 +106,8 @@ def _front_replay() -> tuple[str, ...]:
     return words, "a cost column made of distances", f"{alone} alone, {guarded} under a guard", "–", "1"
 
 
-def costs() -> str:
-    """One line per algorithm: the mean seconds of training and playing a cell, from the quickest of its presets to the
-    slowest."""
-    took = {suite: spent(RESULTS / suite) for suite in ("simple_spread", "mujoco")}
-    lines = []
-    for name in dict.fromkeys(name for found in took.values() for name, _ in found):
-        cells = []
-        for found in took.values():
-            means = sorted({round(np.mean(v)) for (algorithm, _), v in found.items() if algorithm == name})
-            cells.append(" to ".join(f"{m}" for m in dict.fromkeys((means[0], means[-1]))) if means else "–")
-        lines.append((f"`{name}`", *cells))
-    return markdown(("algorithm", "Simple Spread, s", "robots, s"), lines)
-
-
-def spent(folder: Path) -> dict[tuple[str, str], list[float]]:
-    """Seconds of training and playing each cell, by algorithm and preset; without cells that took over what another had
-    learned from the same data."""
-    seconds = defaultdict(list)
-    unpack(folder)
-    for file in sorted((folder / "cells").glob("*/*/*/status.json")):
-        status, name = json.loads(file.read_text()), file.parent.parent.name
-        if status["state"] != "done":
-            continue
-        algorithm = max((a for a in algos.ALGORITHMS if f"{name}-".startswith(f"{a}-")), key=len)
-        if "adopted" in status or (registry.paired(file.parts[-4]) and not _reads_danger(file.parent)):
-            continue
-        results = json.loads((file.parent / "results.json").read_text())
-        trained = max([status.get("train_seconds", 0.0), *(r["train_seconds"] for r in results.values())])
-        seconds[algorithm, name].append(trained + status.get("eval_seconds", 0.0))
-    return seconds
-
-
-def _reads_danger(cell: Path) -> bool:
-    config = json.loads((cell / "config.json").read_text())
-    algorithm = algos.get(config["algorithm"])
-    known = {k: v for k, v in config["config"].items() if hasattr(algorithm.Config, k)}  # cells outlive fields
-    return algorithm.cost_source(build_config(algorithm.Config, known, config["algorithm"])) != "nothing"
-
-
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("README.md", "front"): front,
-    ("docs/performance.md", "cost"): costs,
     ("docs/performance.md", "performance"): speeds,
     **guards_tables.TABLES,
     **planner_tables.TABLES,
