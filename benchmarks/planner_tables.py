@@ -96,7 +96,7 @@ def changes() -> str:
             mine, usual = (played(rows, one, "alone") for one in (name, "as it is"))
             cells.append(brief(mine) if name == "as it is" else less(mine, usual, task) if mine else "–")
         if name == "as it is" or any("**" in cell for cell in cells):
-            lines.append((name.partition(" (")[0], *cells))
+            lines.append((name, *cells))
     return markdown(("`madiff`", *(task.removeprefix("simple_spread-") for task in LEARNED)), lines)
 
 

@@ -197,3 +197,8 @@ def test_prose_of_a_page_that_fails_fails_the_command(tmp_path, capsys):
     assert tools.main(["--pages", "README"]) == 0
     assert tools.main([]) == 1
     assert "1 things to mend" in capsys.readouterr().out
+    (tmp_path / "docs" / "start.md").write_text("Two words.")
+    assert tools.main([]) == 0
+    tools.WORDS = 5
+    assert tools.main([]) == 1  # of six
+    assert "2 pages of 6 words" in capsys.readouterr().out
