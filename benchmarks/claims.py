@@ -951,7 +951,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "Under a shield none costs anything from safe starts**, and none loses 0.01 of its return": of_shielded_pool,
         "Under `full` clones earn more than the data does": of_full_pool,
         "On medium and random alone none earns more than 0.33; under `full` all earn 1.2 or more": of_full_pools,
-        "a clone of the best tenth and MA-TD3+BC earn what the best driver does": of_medium_pool,
+        "a clone of the best tenth and MA-TD3+BC earn about what the best driver's episodes do": of_medium_pool,
         "none of them corrected (`select`), earns more than `flow` alone on both": of_selection,
         "earns more than a clone under the same guard on eight of nine data sets and less on none": BEST_OF_EIGHT,
         "**The first proposal alone** earns more on four of nine and less on two": FIRST_ALONE,
