@@ -275,6 +275,8 @@ def _modules(title: str, modules: tuple[str, ...]) -> str:
         directive = f"::: {module}"
         if module.startswith(VALUES):
             directive += "\n    options:\n      filters: ['^Config$', '^Settings$', '^[A-Z][A-Z0-9_]+$']"
+        elif title == "Options":  # and no types of their fields
+            directive += "\n    options:\n      filters: ['!^_', '!^(?!GuardOptions|PlanOptions)[A-Z][a-z]']"
         parts.append(directive)
     return "\n\n".join(parts) + "\n"
 
