@@ -30,7 +30,6 @@ CROSSED: dict[str, tuple[str, Row]] = {
     "MA-TD3+BC": ("guards", ("ma-td3bc", "default")),
     "MA-TD3+BC, Lagrange": ("guards", ("ma-td3bc-lag", "default")),
     "OMAR": ("guards", ("omar", "default")),
-    "MA-CQL": ("simple_spread", ("ma-cql", "default")),
     "FISOR per agent": ("simple_spread", ("fisor", "default")),
     # guards other than the shield that learned
     "BC under `full`": ("guards", ("bc", f"default{FULL}")),

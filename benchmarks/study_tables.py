@@ -10,7 +10,6 @@ import ablations
 import certificates
 import numpy as np
 import pooled
-import public_sets
 from common import markdown, of_json, read
 from evidence import proven
 from families import FAMILIES
@@ -293,17 +292,6 @@ def of_hostile() -> str:
     return markdown(("kinds", *good[1:], "anything else"), [(len(rows), *counts)])
 
 
-def of_public_sets() -> str:
-    lines = []
-    for each in read("public_sets.csv"):
-        owner, command, place, options = public_sets.SETS[each["set"]]
-        name = f"[{each['set']}](https://github.com/{owner}/{place.split('/')[0]})"
-        how = f"`{options}`" if options else f"`{command}`"
-        size = f"{each['episodes']}, {each['steps']}"
-        lines.append((name, how, size, each["agents"], each["unsafe"]))
-    return markdown(("set", "options", "episodes, steps", "agents", "steps with cost"), lines)
-
-
 PROVING, RESULTS_PAGE, ROBUST = "docs/proving-ground.md", "docs/results.md", "docs/robustness.md"
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     (PROVING, "collections"): collections,
@@ -317,5 +305,4 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("docs/export.md", "parity"): export,
     ("docs/ope.md", "ranks"): ranks,
     ("docs/security.md", "hostile"): of_hostile,
-    ("docs/import.md", "public sets"): of_public_sets,
 }
