@@ -1,4 +1,4 @@
-"""What is in every data set of the tasks, the numbers of docs/data-sets.md.
+"""What is in every data set of the tasks, the numbers of docs/data.md.
 
 python benchmarks/data_sets.py            # writes results/data.csv; tasks that are named are added or made anew
 """

@@ -100,7 +100,7 @@ POOLED = ("violation_rate", "return_mean")
 
 def proven(where: str = "proving", files: str = "proving-*.json") -> list[dict[str, Any]]:
     """By system, what seed 0 found, but for `rows`, each the mean over the seeds that played it and the `most`
-    violations of one, the `verdicts` of all seeds, and the `causes` of all."""
+    violations of one and the number of `seeds`, the `verdicts` of all seeds, and the `causes` of all."""
     found, folder = [], RESULTS / where
     for file in sorted(folder.glob(files)):
         others = sorted(folder.glob(f"seed-*/{file.name}"))
@@ -116,4 +116,4 @@ def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
         if "refused" in row:
             return row
     pooled = {name: float(np.mean([row[name] for row in rows])) for name in POOLED}
-    return pooled | {"most": max(row["violation_rate"] for row in rows)}
+    return pooled | {"most": max(row["violation_rate"] for row in rows), "seeds": len(rows)}

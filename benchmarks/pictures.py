@@ -11,9 +11,8 @@ from collections.abc import Callable
 import matplotlib
 import numpy as np
 from certificates import SETTINGS, by_setting
-from common import ROOT, read
+from common import ROOT
 from evidence import mean, tasks_of, variant
-from frontiers import GUARDED, LIMITS, TRAINED
 from stress import in_words, name_of
 
 matplotlib.use("Agg")
@@ -98,29 +97,6 @@ def legend(axis: Axes) -> None:
     axis.legend(handles=names, loc="lower left", frameon=False)
 
 
-def frontiers() -> tuple[Figure, dict]:
-    """Return over cost as limits and margins move, a panel for every task."""
-    rows = read("frontiers.csv")
-    figure, axes = plt.subplots(2, 3, figsize=(11, 6.2), layout="constrained")
-    colours = dict(zip((*GUARDED.values(), *TRAINED.values()), ("#0b6e4f", "#7b2d8b", "#c8553d", "#3b6fb6")))
-    for axis, (name, limits) in zip(axes.ravel(), LIMITS.items()):
-        for method, colour in colours.items():
-            found = [r for r in rows if (r["task"], r["method"]) == (name, method) and r["knob"] != "none"]
-            found.sort(key=lambda r: float(r["value"]))
-            xy = [(float(r["cost"]), float(r["return"])) for r in found]
-            if xy:
-                axis.plot(*zip(*xy), "o-", color=colour, label=method, ms=4, lw=1.2)
-            alone = [r for r in rows if (r["task"], r["method"], r["knob"]) == (name, method, "none")]
-            for r in alone:
-                axis.plot(float(r["cost"]), float(r["return"]), "x", color=colour, ms=7)
-        if registry.get(name).protocol:
-            axis.axvspan(-10, 25, color="0.93", zorder=0)
-        axis.set_xscale("symlog", linthresh=limits[0])
-        axis.set(title=name, xlabel="cost of an episode", ylabel="return", xlim=(-0.1 * limits[0], None))
-    axes[0, 0].legend(fontsize=7)
-    return figure, {"dpi": 80}
-
-
 SPEEDS = (0.0, 0.5, 1.0)
 REACH, FINE = 1.2, 121
 
@@ -174,7 +150,7 @@ GUARD: Box = (6.1, 0.9, 1.6, 1.2)
 
 
 def pipeline() -> tuple[Figure, dict]:
-    """The pipeline of README.md and docs/README.md, to be read on a light and on a dark page."""
+    """The pipeline of README.md, to be read on a light and on a dark page."""
     plt.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "pipeline", "font.family": "sans-serif"}
     figure, axes = plt.subplots(figsize=(7.0, 2.5))
     axes.set(xlim=(-0.1, 8.9), ylim=(-0.1, 3.15), aspect="equal")
@@ -231,7 +207,6 @@ def certificate() -> tuple[Figure, dict]:
 
 PICTURES: dict[str, Callable[[], tuple[Figure, dict]]] = {
     "return-violations.png": return_violations,
-    "frontiers.png": frontiers,
     "certificate.png": certificate,
     "pipeline.svg": pipeline,
     "crossing-barrier.png": crossing_barrier,

@@ -1,24 +1,20 @@
-"""Writes docs/planner-results.md's tables, and the table at a glance in README.md and docs/benchmark.md, from results/
-alone.
-
-    python benchmarks/planner_tables.py
-"""
+"""The planner's tables of docs/results.md, and README.md's table at a glance (tables.py writes the pages)."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from common import RESULTS, markdown, put
+from common import RESULTS, markdown
 from evidence import evaluations, variant
 
 from ringfence.bench import paper
 from ringfence.datasets.registry import TASKS
 from ringfence.evaluation.statistics import mean_of_runs
 
-PAGE = "docs/planner-results.md"
+PAGE = "docs/results.md"
 SPREAD = ("expert", "medium-replay", "medium", "random")
 Rows = list[dict[str, Any]]
 
@@ -37,21 +33,6 @@ def played(rows: Rows, name: str, way: str) -> Rows:
 def episodes(found: Rows, what: str) -> np.ndarray:
     """(seeds, episodes)."""
     return np.array([r["per_episode"][what] for r in found], float)
-
-
-def earned(found: Rows, task: str) -> str:
-    """Mean of the normalised return, with its interval over resets and, of several, over seeds."""
-    x = TASKS[task].normalised_return(episodes(found, "return"))
-    low, high = mean_of_runs(x)
-    return f"{x.mean():.3f} [{low:.3f}, {high:.3f}]"
-
-
-def paid(found: Rows) -> str:
-    """Mean cost of episodes that start safe, and its interval."""
-    cost = episodes(found, "cost")
-    safe = 1.0 - episodes(found, "unsafe_start")
-    low, high = mean_of_runs(cost, safe, least=0.0)
-    return f"{(cost * safe).sum() / safe.sum():.2f} [{low:.2f}, {high:.2f}]"
 
 
 def brief(found: Rows) -> str:
@@ -80,80 +61,51 @@ def less(found: Rows, others: Rows, task: str) -> str:
     return f"**{text}**" if low > 0 or high < 0 else text
 
 
+# Ways of playing the same runs. `icbf` without guidance is `madiff`.
 WAYS = {
-    "as it is": "`icbf`, as it is",
     "alone": "without guidance (`madiff`)",
+    "as it is": "`icbf`, as it is",
     "best of 8": "the best of 8",
     "best of 64": "the best of 64",
-    "best of 64, spread 1": "the best of 64, drawn no wider apart than single plans",
-    "best of 64, spread 5": "the best of 64, drawn wider still (`spread=5`)",
 }
 
 
 def spread() -> str:
-    """A line for each way of playing the same runs, by task."""
+    """A line for each task, a column for each way of playing the same runs."""
     lines = []
     for task in (f"simple_spread-{tier}{pool}" for pool in ("", "-pooled") for tier in SPREAD):
         rows = rows_of("rows", task)
-        if not rows:
-            continue
-        file = json.loads((RESULTS / "planner" / f"rows-{task}.json").read_text())
-        lines.append((f"*{task}*: the logs", "", f"{file['logs']:.3f}", "", "", ""))
-        for way, words in WAYS.items():
-            found = played(rows, "icbf", way)
-            if found:
-                passes = f"{np.mean([r['passes'] for r in found]):.2f}"
-                seconds = f"{np.mean([r['seconds'] for r in found]):.0f}"
-                lines.append((words, str(len(found)), earned(found, task), paid(found), passes, seconds))
-    return markdown(("", "seeds", "return, normalised", "cost of safe starts", "passes", "seconds"), lines)
-
-
-def changes(group: str, way: str, tasks: Sequence[str], paired: str | None = None) -> str:
-    """A line for each row of a group: return / cost, passes and seconds on each task."""
-    heads = [""]
-    for task in tasks:
-        heads += [task.removeprefix("simple_spread-"), "less *as it is*" if paired else "", "passes", "seconds"]
-    names = list(dict.fromkeys(r["name"] for task in tasks for r in rows_of(group, task)))
-    lines = []
-    for name in names:
-        line = [name]
-        for task in tasks:
-            rows = rows_of(group, task)
-            found = played(rows, name, way)
-            apart = less(found, played(rows, paired, way), task) if paired and found and name != paired else ""
-            some = [f"{found[0]['passes']:.2f}", f"{np.mean([r['seconds'] for r in found]):.0f}"] if found else ["", ""]
-            line += [brief(found), apart, *some]
-        lines.append(line)
-    keep = [i for i, head in enumerate(heads) if head or i == 0]
-    return markdown([heads[i] for i in keep], [[line[i] for i in keep] for line in lines])
-
-
-def full() -> str:
-    """What the guard `full` earns from plans and from clones, of the same seeds and on the same resets."""
-    lines = []
-    for task in (f"simple_spread-{tier}" for tier in SPREAD):
-        plans, clones = (played(rows_of("guards", task), name, "under full") for name in ("icbf", "bc"))
-        lines.append((task.removeprefix("simple_spread-"), brief(plans), brief(clones), less(plans, clones, task)))
-    return markdown(("logs", "`full` from plans", "`full` from clones", "difference"), lines)
+        if rows:
+            logs = json.loads((RESULTS / "planner" / f"rows-{task}.json").read_text())["logs"]
+            cells = [brief(played(rows, "icbf", way)) for way in WAYS]
+            lines.append((task.removeprefix("simple_spread-"), f"{logs:.2f}", *cells))
+    return markdown(("logs", "they earn", *WAYS.values()), lines)
 
 
 LEARNED = ("simple_spread-expert", "simple_spread-expert-pooled")
 
 
-def frontier() -> str:
-    """λ of the barrier in training, with guidance inside sampling and without."""
-    task = LEARNED[0]
-    rows = rows_of("frontier", task)
-    names = list(dict.fromkeys(r["name"] for r in rows))
+def changes() -> str:
+    """A line for each change of the planner that differs beyond chance: return less that of *as it is*, by the same
+    seeds on the same resets."""
+    found = {task: rows_of("ablations", task) for task in LEARNED}
     lines = []
-    usual = rows_of("rows", task)
-    seeds = {r["seed"] for r in rows}
-    zero = [r for r in usual if r["seed"] in seeds]
-    for name, some in [("λ = 0", zero), *((name, rows) for name in names)]:
-        row = "icbf" if name == "λ = 0" else name
-        cells = [played(some, row, way) for way in ("alone", "as it is")]
-        lines.append((name, *(brief(cell) for cell in cells)))
-    return markdown(("", "without guidance", "guided"), lines)
+    for name in dict.fromkeys(r["name"] for rows in found.values() for r in rows):
+        cells = []
+        for task, rows in found.items():
+            mine, usual = (played(rows, one, "alone") for one in (name, "as it is"))
+            cells.append(brief(mine) if name == "as it is" else less(mine, usual, task) if mine else "–")
+        if name == "as it is" or any("**" in cell for cell in cells):
+            lines.append((name, *cells))
+    return markdown(("`madiff`", *(task.removeprefix("simple_spread-") for task in LEARNED)), lines)
+
+
+def algorithm1() -> str:
+    """Algorithm 1 as printed, by λ: normalised return / cost of safe starts."""
+    found = {task: rows_of("algorithm1", task) for task in LEARNED}
+    names = dict.fromkeys(r["name"] for rows in found.values() for r in rows)
+    lines = [(name, *(brief(played(rows, name, "as it is")) for rows in found.values())) for name in names]
+    return markdown(("Algorithm 1", *(task.removeprefix("simple_spread-") for task in LEARNED)), lines)
 
 
 def sums_of(name: str, task: str, row: tuple[str, str]) -> str:
@@ -236,39 +188,24 @@ def pooled_logs(task: str) -> str:
     return "–" if data is None else f"{data['return_norm']:.2f} / –"
 
 
-def others() -> str:
-    """Robots and Crossing: the same defaults on systems that chose nothing."""
-    lines = []
-    for task in (*(t for t in paper.PRINTED if not t.startswith("simple")), "crossing-hasty"):
-        for group in ("robots", "crossing"):
-            rows = rows_of(group, task)
-            for name, way in dict.fromkeys((r["name"], way) for r in rows for way in r["plays"]):
-                if (name, way) == ("bc", "alone"):  # nothing guides a clone
-                    continue
-                found = played(rows, name, way)
-                plays = f"{np.mean([r['return_mean'] for r in found]):.4g}"
-                lines.append(
-                    (task, f"`{name}`, {way}", str(len(found)), plays, f"{np.mean([r['cost'] for r in found]):.2f}")
-                )
-    return markdown(("task", "who", "seeds", "return", "cost"), lines)
+def of_paper() -> str:
+    """Normalised return / normalised cost of the paper's rivals, printed and ours; its own method is in `glance`."""
+    measured, lines = paper.lines(RESULTS / name for name in paper.FOLDERS), []
+    for task in paper.PRINTED:
+        cells = []
+        for line in measured:
+            if line.task == task and line.method != "ICBF":
+                reward, _, cost, _ = line.printed
+                cells += [f"*{reward:.2f} / {cost:.2f}*", paper.brief(line)]
+        lines.append((task, *cells))
+    heads = ("*MA-TD3+BC, paper*", "MA-TD3+BC, ours", "*OMAR, paper*", "OMAR, ours")
+    return markdown(("task", *heads), lines)
 
 
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
-    (PAGE, "planner-rows"): spread,
-    (PAGE, "planner-ablations"): lambda: changes("ablations", "alone", LEARNED, "as it is"),
-    (PAGE, "planner-frontier"): frontier,
-    (PAGE, "planner-algorithm1"): lambda: changes("algorithm1", "as it is", LEARNED),
-    (PAGE, "planner-full"): full,
-    (PAGE, "planner-others"): others,
     ("README.md", "glance"): glance,
-    ("docs/benchmark.md", "glance"): glance,
+    (PAGE, "paper"): of_paper,
+    (PAGE, "planner-rows"): spread,
+    (PAGE, "planner-ablations"): changes,
+    (PAGE, "planner-algorithm1"): algorithm1,
 }
-
-
-def write_tables() -> None:
-    for (page, mark), make in TABLES.items():
-        put(page, mark, make())
-
-
-if __name__ == "__main__":
-    write_tables()

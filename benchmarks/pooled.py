@@ -88,12 +88,6 @@ ROWS |= {
 CLONE, ASKED = "bc, 20,000 updates, under adapt", "flow, told the return, under adapt"
 BEST = "flow, told the return, the best of 8, under adapt"
 ROWS[BEST] = ("flow", "return", FLOW, {"guard": "adapt", "num_samples": 8, "select": True})
-# Rows that say no more than others, and are not in the table.
-UNTOLD = {
-    "flow, one driver, its mean",
-    *(f"flow, told raw, {t} asked" for t in (0.5, 1.5)),
-    *(f"flow, {n} steps" for n in (2, 8)),
-}
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow"} | {f"flow, {n} steps, guided by danger": f"flow, {n} steps" for n in (2, 8)}
 

@@ -6,13 +6,32 @@ python benchmarks/replayed.py citr.h5 citr-rest.h5 --radius 0.8 --name citr
 python benchmarks/replayed.py FOLDER --name zara02              # four minutes on one core; or zara01, seq_hotel, …
 python benchmarks/replayed.py FOLDER --name zara02 --faults     # results/stress/pedestrians.csv and its certificates
 
-FILE is a table in one of the layouts of `ringfence data import-table`; docs/replay-results.md says where to get some.
-It is split by time: the first 70 % to learn by, the rest to replay. Two files are the parts that `import-table --split`
-wrote. FOLDER holds `obsmat` files of ETH and UCY (github.com/crowdbotp/OpenTraj, `datasets/UCY/zara02/obsmat.txt`, …).
-A step costs 1 where two centres come closer than the radius, and the World reads nothing but that column. Settings are
-the defaults. What the replay of zara02 showed has chosen how a guard's correction is begun again; the others chose
-nothing. With `--faults` the driven agent has them, as in stress.py, and its guard knows of them or not; a step takes
-0.4 s. Certificates are made of the same windows, of which the first half calibrates the margin.
+FILE is a table in one of the layouts of `ringfence data import-table`: telemetry.csv of github.com/MehmetUnall/
+SynDrone-Swarm (`sample/A-DEN`, `sample/B-DEN`), or what SUMO (`pip install eclipse-sumo`) writes of a town whose
+drivers often ignore who has the right of way:
+
+    netgenerate --grid --grid.number=3 --grid.length=80 --default.lanenumber 1 --default.speed 10 \\
+        -j right_before_left -o town.net.xml
+    echo '<additional><vType id="hasty" sigma="0.8" tau="0.6" speedDev="0.3" minGap="1.0" jmIgnoreFoeProb="0.5" \\
+        jmIgnoreFoeSpeed="10" jmIgnoreJunctionFoeProb="0.3" impatience="1" collisionMinGapFactor="0"/></additional>' \\
+        > types.add.xml
+    python $SUMO_HOME/tools/randomTrips.py -n town.net.xml -o trips.xml -e 1200 -p 1.2 --seed 1 \\
+        --trip-attributes 'type="hasty"' --additional-files types.add.xml --fringe-factor 5
+    sumo -n town.net.xml -a types.add.xml -r trips.xml --step-length 0.5 --fcd-output fcd.xml --collision.action none \\
+        --seed 1 --end 1400
+
+citr.h5 and citr-rest.h5 are of OpenTraj's `datasets/CITR`:
+
+    ringfence data import-table *_traj_ped_filtered.csv --time frame --time-unit 0.03336667 --dt 0.2 --agent id \\
+        --state x y vx vy --rename x_est=x y_est=y vx_est=vx vy_est=vy --neighbours 6 --separation 0.8 \\
+        --max-episode-steps 40 --split 0.7 --task citr --out citr.h5
+
+A table is split by time: the first 70 % to learn by, the rest to replay. Two files are the parts that
+`import-table --split` wrote. FOLDER holds `obsmat` files of ETH and UCY (github.com/crowdbotp/OpenTraj,
+`datasets/UCY/zara02/obsmat.txt`, …). A step costs 1 where two centres come closer than the radius, and the World reads
+nothing but that column. Settings are the defaults. What the replay of zara02 showed has chosen how a guard's correction
+is begun again. With `--faults` the driven agent has them, as in stress.py, and its guard knows of them or not; a step
+takes 0.4 s. Certificates are made of the same windows, of which the first half calibrates the margin.
 """
 
 from __future__ import annotations

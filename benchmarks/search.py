@@ -7,7 +7,7 @@
     python benchmarks/search.py --summary        # ranks of what is there
 
 Simple Spread's task carries no row of any table: it is the fifth of a pool that one learner drove, where tables have
-all of the pool, or another learner. A setting that wins there by the rule of docs/benchmark.md is tried on two more
+all of the pool, or another learner. A setting that wins there by the rule of docs/results.md is tried on two more
 such fifths; icbf's winner of the three, on all logs of experts, too. What is in the file is not made again.
 Setting 0 is the algorithm's preset. The others were written down before the first search, which was on a task of the
 tables (results/tuning/search.csv): omar's and ma-cql's presets of then are among them (on robots bc-safe's, too). The

@@ -654,7 +654,7 @@ def test_places_that_jitter_do_not_make_velocities_doubtful():
 
 def test_public_sets_are_read_by_one_command_each(tmp_path, capsys):
     """Files as Trajnet++, tracks in centimetres without a head, CITR's cart and people, MRCLAM, ADS-B and AIS are
-    written, by the commands of docs/import-tracks.md; a step of each is one of theirs."""
+    written, by the commands of docs/import.md; a step of each is one of theirs."""
     frames = range(30)
     scene = json.dumps({"scene": {"id": 0, "p": 1, "s": 0, "e": 290, "fps": 2.5}})
     tracks = [json.dumps({"track": {"f": k * 10, "p": i, "x": k * 0.4, "y": i}}) for i in (1, 2) for k in frames]
@@ -679,7 +679,7 @@ def test_public_sets_are_read_by_one_command_each(tmp_path, capsys):
     written(tmp_path / "states.csv", "time,icao24,lat,lon,velocity", *states, *states[5:9])
     ships = [f"31/12/2015 23:{k:02d}:00,21{i},{55 + k * 1e-3},{10 + i * 0.1},3.6" for i in (0, 1) for k in frames]
     written(tmp_path / "aisdk.csv", "# Timestamp,MMSI,Latitude,Longitude,SOG", *ships)
-    page = Path(__file__).resolve().parent.parent.joinpath("docs", "import-tracks.md").read_text()
+    page = Path(__file__).resolve().parent.parent.joinpath("docs", "import.md").read_text()
     commands = re.findall(
         r"^    ringfence (data import-table (?:crowds|corridor|clip|Robot|states|aisdk).*)$", page, re.M
     )

@@ -86,6 +86,7 @@ REFERENCE = {
         "ringfence.guards.wrap",
     ),
     "Planners": ("ringfence.proposals.planner",),
+    "Options": ("ringfence.guards.options", "ringfence.proposals.options"),
     "Algorithms": (
         "ringfence.types",
         "ringfence.algos",
@@ -111,12 +112,11 @@ VALUES = ("ringfence.algos.", "ringfence.world.fit")
 # Of a simulator's tasks, in words; of another one the first line of its docstring.
 ABOUT: dict[type, str] = {
     SimpleSpread: "Agents cover landmarks without touching one another; physics and rewards of OMAR's data "
-    "([protocol](../evaluation.md#simple-spreads-two-integrators), [data](../data-sets.md#simple-spread)).",
+    "([data](../data.md#simple-spread)).",
     SafeMuJoCo: "Agents share the joints of one robot that must not run faster than a limit: safety-gymnasium's Safe "
-    "Multi-Agent MuJoCo ([simulator](../data-sets.md#robots-the-simulator), "
-    "[data](../data-sets.md#halfcheetah-and-ant)).",
+    "Multi-Agent MuJoCo ([data](../data.md#halfcheetah-and-ant)).",
     Crossing: "Discs with momentum find their way through one another, any number of them; each sees and decides for "
-    "itself ([Crossing](../crossing.md)).",
+    "itself ([data](../data.md#crossing)).",
     System: "A system of the proving ground: small, and of a kind that the library was not made for. Costs alone "
     "say what is dangerous.",
 }
@@ -141,7 +141,12 @@ SUITES = (
 )
 NAMED = ("algorithm", "variant", "guard", "barrier", "execution", "agents")  # what a row of a table is called by
 # Pages that stand outside docs/, and their places on the site.
-OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "results/README.md": "results.md"}
+OUTSIDE = {
+    "README.md": "README.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "results/README.md": "results-folders.md",
+}
 
 
 def on_config(config):
@@ -153,7 +158,7 @@ def on_config(config):
     nav["Reference"] += [{"Tasks": ["tasks/README.md", *tasks]}]
     nav["Reference"] += [{"Python": ["reference/README.md", *({title: _place(title)} for title in REFERENCE)]}]
     nav["Reference"] += [{"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}]
-    nav["Reference"] += [{"Results folders": "results.md"}]
+    nav["Reference"] += [{"Results folders": "results-folders.md"}]
     return config
 
 
@@ -233,11 +238,14 @@ def from_root(file: Path) -> str:
         there = Path(os.path.normpath(file.parent / path)).relative_to(ROOT)
         if str(there) in OUTSIDE:
             return f"[{words}]({OUTSIDE[str(there)]}{hash}{place})"
+        if there.suffix == ".ipynb":
+            return f"[{words}](tutorials/{there.stem}.md)"
         if there.parts[0] == "docs":
             return f"[{words}]({there.relative_to('docs')}{hash}{place})"
         return words if words.strip("`") == str(there) else f"{words} (`{there}`)"
 
-    return re.sub(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)", turned, file.read_text())
+    text = file.read_text().replace("](docs/images/", "](images/")
+    return re.sub(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)", turned, text)
 
 
 def _place(title: str) -> str:
@@ -267,6 +275,8 @@ def _modules(title: str, modules: tuple[str, ...]) -> str:
         directive = f"::: {module}"
         if module.startswith(VALUES):
             directive += "\n    options:\n      filters: ['^Config$', '^Settings$', '^[A-Z][A-Z0-9_]+$']"
+        elif title == "Options":  # and no types of their fields
+            directive += "\n    options:\n      filters: ['!^_', '!^(?!GuardOptions|PlanOptions)[A-Z][a-z]']"
         parts.append(directive)
     return "\n\n".join(parts) + "\n"
 
@@ -397,7 +407,7 @@ def _rows(task: Task) -> list[str]:
     said = (
         "Means over seeds, as `table.csv` has them; one seed compares no methods. Intervals, ranks and what the rows "
     )
-    said += "say: [tables](../tables.md), [the grid](../benchmark.md), [who does what](../attribution.md)."
+    said += "say: [results](../results.md)."
     return ["## Results", "", said, "", *lines]
 
 

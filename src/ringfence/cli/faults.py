@@ -13,7 +13,7 @@ from ringfence.faults.faults import Chance, Faults
 
 @dataclass(frozen=True)
 class FaultFlags(Faults):
-    """What goes wrong; docs/stress.md says what each does."""
+    """What goes wrong; docs/certificates.md says what each does."""
 
     asynchrony: Annotated[Chance, tyro.conf.arg(name="async")] = 0.0
     """share of steps that an agent lets pass, each in its own rhythm."""

@@ -71,7 +71,7 @@ def play(
     dictionary are those of constraints by name, and the result's `constraints` has each beside its limit. Where there
     are none, 1 if the run's hazard calls the state unsafe that the step leads to.
 
-    The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
+    The summary is that of an evaluation (docs/data.md), without what needs a benchmark's constants.
     """
     keep_programs()
     _check_sizes(episodes, num_envs, seed, max_episode_steps)

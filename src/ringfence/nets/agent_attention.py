@@ -1,7 +1,7 @@
 """A denoiser of agents: one token per agent holds its whole window, attention runs across agents.
 
 The number of agents appears in no weight unless they are distinguished. It learns joint policies more slowly than one
-network of the team (docs/planner-results.md), which homogeneous agents, who are teams of one each, need no more either.
+network of the team (docs/results.md), which homogeneous agents, who are teams of one each, need no more either.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 At high noise a denoiser has to answer with the mean of all plans from here, whatever noise it is shown. A network that
 is shown none learns that mean much faster, and where it is good, little is left for the denoiser
-(docs/planner-results.md).
+(docs/results.md).
 Where plans from one state differ widely, much is left, and the denoiser does what it always did.
 """
 

@@ -1,7 +1,7 @@
 """A residual network for whole teams: everybody's entries in one vector.
 
 With a few agents whose behaviour differs it learns much faster than attention or a network for each
-(docs/history.md)."""
+(results/failed.md)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A denoiser of whole teams: everybody's window in one vector, through a residual network.
 
-It learns a team of a few agents faster than attention does (docs/history.md); its weights are for
+It learns a team of a few agents faster than attention does (results/failed.md); its weights are for
 one number of agents, whom it tells apart.
 """
 

@@ -1,4 +1,4 @@
-"""What entries' names say: whose each is, which of several, in which role and along which axis (docs/arrays.md)."""
+"""What entries' names say: whose each is, which of several, in which role and along which axis (docs/import.md)."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def _recognised(path: Path, f: h5py.File) -> list[str]:
     if not flat:
         what = f"holds '{names[0]}'" if names else "holds nothing"
         raise StoreError(
-            f"'{path}' {what}, which fits neither DSRL, D4RL nor Minari; see docs/import-hdf5.md for their names."
+            f"'{path}' {what}, which fits neither DSRL, D4RL nor Minari; see docs/import.md for their names."
         )
     if strays:
         raise StoreError(f"'{path}' mixes layouts: Minari's '{strays[0]}' lies beside '{flat[0]}'; keep one of them.")

@@ -152,7 +152,7 @@ def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
     strays = [n for n in group if n in FOREIGN]
     if strays:
         raise StoreError(
-            f"'{path}' mixes layouts: '{name}' holds {FOREIGN[strays[0]]}'s '{strays[0]}'; see docs/import-hdf5.md."
+            f"'{path}' mixes layouts: '{name}' holds {FOREIGN[strays[0]]}'s '{strays[0]}'; see docs/import.md."
         )
     missing = [n for n in NAMES if n not in group]
     if missing:

@@ -2,7 +2,7 @@
 
 What agents see is made of the columns of their state: their own entries (`own.x`), where the goal is (`goal.dx`), and
 where others are and how they move relative to them (`other0.dx`, `other0.dvx`), named so that a World knows what
-follows from what (docs/import-tables.md).
+follows from what (docs/import.md).
 """
 
 from __future__ import annotations
