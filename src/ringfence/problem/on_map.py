@@ -195,7 +195,10 @@ def _listed(steps: _Steps, found: Sequence[str]) -> list[int]:
     from where everybody is."""
     known = Entries.of(found)
     own = {e.what: e.source for e in known.each if e.whose == "own"}
-    told = [e for e in known.each if e.whose == "other" and e.role in ("offset", "drift") and e.what[1:] in own]
+    of_others = [e for e in known.each if e.whose == "other"]
+    if not all(e.what[1:] in own for e in of_others if e.role == "offset"):
+        return []  # of velocities alone nothing is known of who comes
+    told = [e for e in of_others if e.role in ("offset", "drift") and e.what[1:] in own]
     x = steps.before
     agents = x.shape[1]
     moves = False
