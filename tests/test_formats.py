@@ -517,6 +517,26 @@ def test_several_files_with_episodes_of_their_own():
         EpisodeStore.from_table([parts[0], dates], **schema)
 
 
+def test_agents_of_joined_files_are_called_after_what_tells_the_files_apart(tmp_path):
+    import pandas as pd
+
+    frame = pd.DataFrame(track(40)).query("id == 0").drop(columns="id")
+    files = [tmp_path / folder / name for folder in ("r1", "r2") for name in ("pose.csv", "pose.jsonl")]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        frame.to_csv(file, index=False) if file.suffix == ".csv" else frame.to_json(file, orient="records", lines=True)
+    schema = {"time": "t", "agent": "id", "state": ["x", "y"], "join": True}
+    for given, agents in (
+        (files[::2], ["r1/pose", "r2/pose"]),
+        (files[:2], ["pose.csv", "pose.jsonl"]),
+        (files[:3], ["r1/pose.csv", "r1/pose.jsonl", "r2/pose.csv"]),
+        ([frame, files[0]], ["0", "pose"]),
+    ):
+        assert EpisodeStore.from_table(given, **schema).card.agents == agents
+    with pytest.raises(UserError, match="pose.csv' is given twice"):
+        EpisodeStore.from_table([files[0], tmp_path / "r2" / ".." / "r1" / "pose.csv"], **schema)
+
+
 def test_drones_telemetry_is_read_as_it_is(tmp_path):
     """SynDrone-Swarm: a row per drone and frame, at times that jitter; z is down."""
     head = "ScenarioID,DroneID,Frame,Time,X,Y,Z,Vel,VelX,VelY,VelZ,Roll,Pitch,Yaw,Role,Intent,Target,IsObserver,TimeStr"

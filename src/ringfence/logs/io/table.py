@@ -7,6 +7,7 @@ follows from what (docs/import-tables.md).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -111,7 +112,7 @@ def read_parts(
     both parts. Without a share, all of the time is one part."""
     of_kind("card", card, Mapping | None, "give a dictionary of its fields")
     of_kind("notes", notes, Sequence, "give a list of sentences")
-    columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])
+    columns, schema = _joined([_columns_of(one, schema, whose) for whose, one in _each(table, schema.join)])
     columns, metres = in_metres(columns, schema)
     columns, schema, angles = without_angles(columns, schema)
     rows = sorted_rows(columns, schema)
@@ -140,13 +141,14 @@ def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple
     """A table in a published format (`LAYOUTS`), or several, as one that `read_table` takes, and its schema; options
     are those of a `TableSchema` beside columns."""
     known = one_of("layout", layout, LAYOUTS)
-    tables = [_of_layout(one, known, layout, options, k) for k, one in enumerate(_each(table))]
+    join = bool(options.get("join"))
+    tables = [_of_layout(one, known, layout, options, whose) for whose, one in _each(table, join)]
     columns, schema = _joined(tables)
     return columns, replace(schema, join=False)
 
 
 def _of_layout(
-    table: Table, known: Layout, layout: str, options: Mapping[str, Any], number: int
+    table: Table, known: Layout, layout: str, options: Mapping[str, Any], whose: str
 ) -> tuple[Columns, TableSchema]:
     names = {"time": "time", "agent": "agent", "state": known.state, "action": known.action}
     for name in names:
@@ -163,17 +165,27 @@ def _of_layout(
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
     if schema.join:
-        columns["agent"] = _after_the_table(table, columns, schema, number)
+        columns["agent"] = _after_the_table(whose, columns, schema)
     return columns, schema
 
 
-def _each(table: Tables) -> Sequence[Table]:
-    """Tables, of one or several."""
-    if not isinstance(table, list | tuple):
-        return [table]
-    if not table:
+def _each(table: Tables, join: bool) -> list[tuple[str, Table]]:
+    """Tables, of one or several, and what agents are called after where they `join`: as much of the end of paths as
+    tells them apart, and the number of what is no file."""
+    tables = list(table) if isinstance(table, list | tuple) else [table]
+    if not tables:
         raise UserError("The list of tables is empty; give one table, or several.")
-    return table
+    files = [Path(os.path.abspath(one) if isinstance(one, str | Path) else str(k)) for k, one in enumerate(tables)]
+    names = [""] * len(files)
+    for paths in ([file.with_suffix("") for file in files], files) if join else ():
+        for many in range(1, max(len(path.parts) for path in paths) + 1):
+            names = [str(Path(*path.parts[-many:])) for path in paths]
+            if len({*names}) == len(names):
+                return list(zip(names, tables))
+    if join:
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UserError(f"'{twice}' is given twice, and its agents would be one; give each table once.")
+    return list(zip(names, tables))
 
 
 def _joined(tables: list[tuple[Columns, TableSchema]]) -> tuple[Columns, TableSchema]:
@@ -202,8 +214,8 @@ def _one_after_another(name: str, parts: list[np.ndarray]) -> np.ndarray:
         raise StoreError(f"{name} is {kinds} in tables that are given together; write it in one way.") from None
 
 
-def _columns_of(table: Table, schema: TableSchema, number: int) -> tuple[Columns, TableSchema]:
-    """The schema's columns of table `number` under our names, and the schema with the entries of its lists."""
+def _columns_of(table: Table, schema: TableSchema, whose: str) -> tuple[Columns, TableSchema]:
+    """The schema's columns of a table under our names, and the schema with the entries of its lists."""
     theirs = {ours: their for their, ours in schema.rename.items()}
     texts = [name for name in (schema.agent, schema.episode, schema.time_format and schema.time) if name]
     form = Form(schema.header, schema.decimal, tuple(theirs.get(name, name) for name in texts))
@@ -216,7 +228,7 @@ def _columns_of(table: Table, schema: TableSchema, number: int) -> tuple[Columns
         read = read_columns(table, [theirs.get(name, name) for name in named], form)
         columns = {name: read[theirs.get(name, name)] for name in named}
     if schema.join:
-        columns[schema.agent] = _after_the_table(table, columns, schema, number)
+        columns[schema.agent] = _after_the_table(whose, columns, schema)
     columns[schema.time] = dates(columns[schema.time], schema.time_format)
     names = entry_names(table)
     return _expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
@@ -244,9 +256,8 @@ def _expanded(
     return found, replace(schema, **fields)
 
 
-def _after_the_table(table: Table, columns: Columns, schema: TableSchema, number: int) -> np.ndarray:
+def _after_the_table(whose: str, columns: Columns, schema: TableSchema) -> np.ndarray:
     """(M,) names of the agents of a table that is joined with others."""
-    whose = Path(table).stem if isinstance(table, str | Path) else str(number)
     if schema.agent not in columns:
         return np.full(len(columns[schema.time]), whose)
     return np.array([f"{whose}/{name}" for name in words(columns, schema.agent)])
