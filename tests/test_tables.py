@@ -634,6 +634,43 @@ def test_no_row_slips_however_long_or_wrong_the_clock(times, options, dt):
     assert len(drifts) == (dt is None or "dt" in options)
 
 
+@pytest.mark.parametrize(
+    ("dt", "many", "rounded"),
+    [
+        (1 / 60, 30_000, lambda t: np.round(t, 3)),
+        (1 / 60, 30_000, lambda t: np.floor(t * 100) / 100),
+        (1 / 60, 30_000, lambda t: 1.7e9 + np.round(t, 3)),
+        (1 / 60, 60, lambda t: np.round(t, 3)),
+        (0.01, 20_000, lambda t: (1e5 + t).astype(np.float32)),
+        (0.01, 20_000, lambda t: (1e4 + t).astype(np.float32)),
+        (0.75, 30_000, lambda t: np.round(t, 1)),
+    ],
+)
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_rounded_times_are_those_that_they_were_rounded_from(dt, many, rounded, late):
+    """Of agents that share a clock, and of two that do not."""
+    k = np.arange(many)
+    times, other = rounded(k * dt), rounded((k + late) * dt)
+    table = {
+        "t": np.r_[times, other],
+        "id": np.repeat([0, 1], many),
+        "x": np.tile(k * dt, 2),
+        "hit": np.zeros(2 * many),
+    }
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x"], cost="hit")
+    assert abs(store.card.dt / dt - 1) < 2e-5 and abs(store.steps - many) <= 2
+    assert not any("drifts" in note for note in store.card.warnings)
+    assert any("times are rounded to" in note for note in store.card.warnings)
+    assert np.abs(np.diff(entry(store, "own.x"), axis=0) / dt - 1).max() < 0.03
+
+
+def test_rows_that_are_lost_do_not_make_another_clock():
+    chance = np.random.default_rng(0)
+    for kept in (np.delete(ROWS, [40, 90]), np.sort(chance.permutation(ROWS)[:24_000]), ROWS[ROWS % 10 > 0]):
+        store, _ = clocked(kept * 0.1)
+        assert store.card.dt == 0.1 and not any("rounded" in note for note in store.card.warnings)
+
+
 def test_times_without_a_clock_are_not_counted_by_rows():
     """Two rates that are far apart, and none: states are where they were at that time."""
     two = np.cumsum(np.where(ROWS[:4000] < 2000, 0.1, 0.115))

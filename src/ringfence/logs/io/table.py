@@ -44,7 +44,7 @@ from ringfence.logs.io.rows import (
     without_jumps,
 )
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample
+from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample, unrounded
 from ringfence.logs.io.units import in_metres, without_angles
 from ringfence.logs.io.wide import read_wide
 from ringfence.logs.moving import looked_at, origins_of
@@ -121,6 +121,7 @@ def read_parts(
     values = values_of(columns, rows, schema)
     rows, values, dropped = without_jumps(rows, values, schema)
     refuse_jumps(rows, values, schema)
+    rows, rounded = unrounded(rows)
     clock = clock_of(rows, schema)
     doubtful = list(doubts(rows, values, clock.dt, schema))
     lost = any(blurred(rows, values))
@@ -133,7 +134,18 @@ def read_parts(
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
-    warnings = [*notes, *metres, *angles, *repeated, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
+    warnings = [
+        *notes,
+        *metres,
+        *angles,
+        *repeated,
+        *dropped,
+        *rounded,
+        *doubtful,
+        *drifts,
+        *_made_of(schema),
+        *episodes.notes,
+    ]
     return _arrays(motion, episodes, warnings, card or {}, lost), int(early.sum())
 
 
