@@ -582,6 +582,16 @@ def test_an_end_inside_a_track_ends_an_episode():
         store = EpisodeStore.from_table(table, **options, dt=dt)
         assert np.array_equal(store.episode_ends, ends) and store.episode_terminated.all()
         assert np.ptp(entry(store, "own.vx")) < 1e-3  # never -950 m/s, which a seam would be
+    flagged = table["end"] & (table["id"] == 0)  # by one of the team alone
+    for late in (0.0, 0.02):
+        alone = table | {"end": flagged, "t": table["t"] + late * table["id"]}
+        store = EpisodeStore.from_table(alone, **options)
+        assert np.ptp(entry(store, "own.vx")) < 1e-3 and store.episodes == 2 and store.episode_terminated.all()
+    left = {
+        name: column[(table["id"] == 0) | (table["t"] < 0.65) | (table["t"] > 2.95)] for name, column in table.items()
+    }
+    store = EpisodeStore.from_table(left | {"end": left["end"] & (left["id"] == 0)}, **options)
+    assert store.episode_terminated.tolist() == [False, True]  # who left before did not end there
     one = EpisodeStore.from_table(table, **options, neighbours=1)
     assert one.episodes == 4 and one.episode_terminated.all()
     with pytest.raises(StoreError, match="moved at"):
