@@ -146,14 +146,43 @@ def team_episodes(motion: Motion) -> Episodes:
     cost = motion.tracks.cost[rows]
     if motion.schema.separation is not None:
         cost = _too_close(motion.place[rows], motion.schema.separation.radius)
-    notes = (*short, *_left_out(motion, rows))
-    return Episodes(rows, lengths, entries, cost, notes, agents=_members(motion, rows))
+    members, changes = _members(motion, rows)
+    return Episodes(rows, lengths, entries, cost, (*short, *_left_out(motion, rows), *changes), agents=members)
 
 
-def _members(motion: Motion, rows: np.ndarray) -> list[str] | None:
-    """Who stands in each column of rows (W, N), where that is the same agent throughout."""
+def _members(motion: Motion, rows: np.ndarray) -> tuple[list[str] | None, tuple[str, ...]]:
+    """Who stands in each column of rows (W, N), where that is the same agent throughout; else what is said of it."""
     who = motion.tracks.agent[rows]
-    return None if (who != who[0]).any() else [str(name) for name in motion.agents[who[0]].tolist()]
+    if not (who != who[0]).any():
+        return [str(name) for name in motion.agents[who[0]].tolist()], ()
+    if who.shape[1] == 1:
+        return None, ()
+    places = np.unique(np.stack([who, np.broadcast_to(np.arange(who.shape[1]), who.shape)]).reshape(2, -1), axis=1)
+    moved = motion.agents[np.flatnonzero(np.bincount(places[0]) > 1)].tolist()
+    said = "the team changes its members: who comes is seen where somebody left"
+    if moved:
+        said += f", and so {', '.join(map(str, moved[:5]))}{', ...' * (len(moved) > 5)} change places"
+    return None, (said,)
+
+
+def _in_place(motion: Motion, rows: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Rows (W, N) of windows of `there` rows each, in which agents stay in the column that they had, where nobody who
+    was there in the window before has it now; who is new has the first that is free."""
+    members = motion.tracks.agent[rows[np.cumsum(there) - there]]
+    order = np.empty_like(members)
+    place: dict[int, int] = {}
+    before: set[int] = set()
+    for window, who in enumerate(members.tolist()):
+        taken: dict[int, int] = {}
+        for agent in sorted(who, key=lambda agent: agent not in before):
+            if agent in place:
+                taken.setdefault(place[agent], agent)
+        free = iter(sorted({*range(len(who))} - taken.keys()))
+        taken |= {next(free): agent for agent in who if taken.get(place.get(agent, -1)) != agent}
+        place |= {agent: column for column, agent in taken.items()}
+        order[window] = [who.index(taken[column]) for column in range(len(who))]
+        before = set(who)
+    return np.take_along_axis(rows, np.repeat(order, there, 0), 1)
 
 
 def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -161,6 +190,7 @@ def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ..
     short."""
     schema = motion.schema
     rows, there, n = teams(motion.tracks, schema.team)
+    rows = _in_place(motion, rows, there)
     index, lengths = cut(there, schema.min_episode_steps, schema.max_episode_steps)
     if not len(lengths):
         here = np.unique(motion.tracks.agent).size
