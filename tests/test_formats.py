@@ -629,6 +629,46 @@ def test_degrees_are_no_metres(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "said", "remedy"),
+    [
+        ("x_cm", r"in cm by its name.* scale of x \(--scale x=...\) 0.01, or 1", {"scale": {"x": 0.01}}),
+        ("xMm", "in mm by its name", {"scale": {"x": 0.001}}),
+        ("Local X (feet)", "in feet by its name.* 0.3048", {"scale": {"x": 0.3048}}),
+        ("x_px", "in px by its name.* the metres of one", {"scale": {"x": 0.05}}),
+        ("x_deg", "in degrees by its name.* project='utm'", {"project": "none"}),
+        ("timestamp_ms", r"counts ms by its name.* time_unit \(--time-unit\) 0.001, or 1", {"time_unit": 0.001}),
+        ("time [µs]", "counts µs by its name", {"time_unit": 1.0}),
+        ("FrameId", "counts frame by its name.* the seconds of one", {"time_unit": 0.04}),
+        ("vx_km_h", "in kmh by its name.* 0.277778", {"scale": {"vx": 1 / 3.6}}),
+        ("yaw_deg", "in degrees by its name; call it yaw_deg", {"scale": {"yaw": np.pi / 180}}),
+    ],
+)
+def test_units_that_names_tell_are_asked_for(name, said, remedy):
+    table = track(40) | {"vx": track(40)["y"], "yaw": track(40)["y"]}
+    ours = (
+        "t" if "t" == name[0].lower() or "Frame" in name else next(x for x in ("vx", "yaw", "x") if x in name.lower())
+    )
+    table[name] = table.pop(ours)
+    how = {"time": "t", "agent": "id", "state": ["x", "y", "vx", "yaw"], "rename": {name: ours}}
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.from_table(table, **how)
+    EpisodeStore.from_table(table, **how, **remedy, max_speed=1e6)
+
+
+def test_names_that_hold_no_unit_are_left_alone():
+    table = track(40)
+    for x, y, t in (
+        ("px", "py", "t"),
+        ("robot_px", "robot_py", "Timestamp"),
+        ("x_m", "y_m", "time_s"),
+        ("cm", "mm", "t"),
+    ):
+        given = {x: table["x"], y: table["y"], t: table["t"], "id": table["id"]}
+        how = {"time": t, "agent": "id", "state": ["x", "y"], "rename": {x: "x", y: "y"}}
+        assert EpisodeStore.from_table(given, **how).steps == 39
+
+
+@pytest.mark.parametrize(
     ("entry", "option", "wanted"),
     [
         ("13/11/2015 23:59:{:02d}", "time_format", "%d/%m/%Y %H:%M:%S"),

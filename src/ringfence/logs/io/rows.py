@@ -72,7 +72,7 @@ class Values:
 def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     """The rows in order; an agent's times must increase."""
     dates = columns[schema.time].dtype.kind in "mM"
-    clock = seconds(columns, schema.time) * (1.0 if dates else schema.time_unit)
+    clock = seconds(columns, schema.time) * (1.0 if dates else schema.time_unit or 1.0)
     agents, owner = numbered(words(columns, schema.agent))
     recording = np.zeros(len(clock), int)
     if schema.episode is not None:

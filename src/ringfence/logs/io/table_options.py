@@ -12,7 +12,7 @@ class Columns:
 
     time: str = "time"
     """column of times, s (or of dates)."""
-    time_unit: float = 1.0
+    time_unit: float | None = None
     """seconds of one, where times are something else, e.g. 0.001 of ms, 0.04 of frames at 25 a second."""
     agent: str = "agent"
     """column that tells agents apart."""
