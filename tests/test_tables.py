@@ -701,6 +701,12 @@ def test_events_keep_their_sum_whatever_the_steps():
         store = EpisodeStore.from_table(table, **options, dt=dt)
         assert store.costs.sum() == 1 and store.rewards.sum() == len(t) - 1
         assert np.isclose((np.flatnonzero(store.costs)[0] + 1) * store.card.dt, at)
+    after = table | {"hit": np.isclose(t, 1.5) * 1.0}  # of the hole, which is longer than the gap
+    said = "1 episodes begin with a row that costs something, which no step leads to: that cost is left out"
+    for pieces in ({}, {"max_episode_steps": 5, "min_episode_steps": 1}):
+        store = EpisodeStore.from_table(after, **options, gap=0.3, **pieces)
+        assert store.costs.sum() == 0 and sum(note.startswith(said) for note in store.card.warnings) == 1
+    assert not any("begin with" in note for note in EpisodeStore.from_table(after, **options, gap=1.0).card.warnings)
     lasts = table | {"hit": ((t > 0.85) & (t < 2.05)) * 1.0}
     store = EpisodeStore.from_table(lasts, **options)
     assert store.costs.sum() == lasts["hit"].sum()  # danger on both sides of the hole is danger in it

@@ -316,6 +316,7 @@ def _arrays(
         if costs.shape[1] > 1 and costs.any():
             warnings = [*warnings, "all agents have the same costs: they are taken for the team's"]
         costs = costs[:, 0]
+    warnings = [*warnings, *_costly_starts(motion, episodes)]
     actions = _actions(motion, episodes)[episodes.leaves]
     low, high = _of_commands(actions) if schema.action else _usual(actions)
     warnings = [*warnings, *_one_sided(schema.action, low, high, card)]
@@ -358,6 +359,18 @@ def _arrays(
         "terminated": motion.tracks.ended[episodes.rows[episodes.last]].any(1),
         "card": {**facts, **card},
     }
+
+
+def _costly_starts(motion: Motion, episodes: Episodes) -> Iterator[str]:
+    """What costs something on the row that an episode begins with, and is not that which one before ends with."""
+    starts = np.flatnonzero(~episodes.arrives)
+    own = ~np.isin(episodes.rows[starts, 0], episodes.rows[episodes.last, 0])
+    lost = int(episodes.cost[starts[own]].any((1, 2)).sum())
+    if motion.schema.cost and lost:
+        yield (
+            f"{lost} episodes begin with a row that costs something, which no step leads to: that cost is left out (a "
+            "longer gap lets an episode go on over a hole)"
+        )
 
 
 def _of_commands(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
