@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import tarfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -317,6 +318,41 @@ def test_ctrl_c_is_not_swallowed():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split() == ["heard", "finished", "heard"]
+
+
+@pytest.mark.parametrize(
+    ("within", "presses", "seconds"),
+    [
+        ("time.sleep(60)", 1, (1.5, 20)),
+        ("np.linalg.svd(np.ones((4000, 4000)))", 1, (1.5, 40)),  # which hears no signal
+        ("time.sleep(60)", 2, (0, 20)),
+        ("with interrupts.held(): time.sleep(60)", 2, (0, 20)),
+        ("with interrupts.held(): time.sleep(4)", 1, (3.5, 20)),
+        ("with interrupts.held(False): time.sleep(60)", 1, (1.5, 20)),
+        ("interrupts.check()", 1, (0, 20)),
+    ],
+)
+def test_ctrl_c_ends_what_does_not_hear_it_and_leaves_nothing_half_written(within, presses, seconds, tmp_path):
+    code = (
+        "import signal, sys, threading, time\nimport numpy as np\nfrom ringfence.cli import app\n"
+        "from ringfence.__main__ import main\nfrom ringfence.utils import interrupts\n"
+        "from ringfence.utils.files import whole\n"
+        "class Freed:\n    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
+        "def press():\n    time.sleep(0.7)\n    signal.raise_signal(signal.SIGINT)\n"
+        f"def command():\n    with whole({str(tmp_path / 'a.txt')!r}) as part:\n        part.write_text('half')\n"
+        f"        Freed()\n        if {presses} > 1: threading.Thread(target=press).start()\n"
+        f"        {within}\n"
+        "app.COMMANDS['tasks'] = command\nsys.argv[1:] = ['tasks']\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\nprint(flush=True)\nmain()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as asked:
+        asked.stdout.readline()
+        begun = time.monotonic()
+        said = asked.communicate(timeout=60)[1]
+    assert asked.returncode == 130 and "interrupted" in said and "Traceback" not in said
+    assert seconds[0] <= time.monotonic() - begun < seconds[1] and not list(tmp_path.iterdir())
 
 
 SWALLOWED = """

@@ -22,6 +22,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
+from ringfence.utils import interrupts
 from ringfence.utils.content import content_of
 from ringfence.utils.files import writable
 from ringfence.utils.functions import of_both
@@ -93,7 +94,8 @@ def collect(
     with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
         try:
             for k in range(begun, episodes):
-                keeper.add(_played(simulators, player, space, seed, k))
+                with interrupts.held(k > begun):
+                    keeper.add(_played(simulators, player, space, seed, k))
                 if k == 0 and "hazard" not in (card or {}):
                     _warn_unless_charged(simulator, keeper.fresh)
                 bar.advance(1)

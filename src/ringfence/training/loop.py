@@ -32,6 +32,7 @@ from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
 from ringfence.training.runs import LOGS, Run, write_json
 from ringfence.types import Array, Key, Metrics, PyTree
+from ringfence.utils import interrupts
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import fields_of
 from ringfence.utils.environment import environment
@@ -336,7 +337,8 @@ class _Training:
             try:
                 while self.step < steps:
                     count = min(self.options.chunk - self.step % self.options.chunk, steps - self.step)
-                    means = self._advance(program, count)
+                    with interrupts.held(self.saved < self.step):
+                        means = self._advance(program, count)
                     bar.advance(count, means)
                     if self.options.on_chunk:
                         self.options.on_chunk(self.step, means)
