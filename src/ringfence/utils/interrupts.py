@@ -25,7 +25,7 @@ BOUNCE = 0.3  # s within which it is one press that several processes tell of
 unfinished: set[Path] = set()  # files that are being written
 _asked = False
 _honoured = False
-_held = 0
+_held: list[object] = []
 _told: tuple[socket, socket] | None = None  # into one of which the system writes at once, whatever Python does
 
 
@@ -74,7 +74,7 @@ def _insist(told: socket) -> None:
     while told.recv(1)[0] != signal.SIGINT:
         pass
     _asked, begun = True, time.monotonic()
-    while _held or _honoured or time.monotonic() - begun < MOMENT:
+    while any(_held) or _honoured or time.monotonic() - begun < MOMENT:
         if select.select([told], [], [], 0.05)[0]:
             again = told.recv(1)[0] == signal.SIGINT
             if again and time.monotonic() - begun > BOUNCE:
@@ -103,11 +103,10 @@ def check() -> None:
 
 @contextmanager
 def held(kept: object = True) -> Iterator[None]:
-    """Finish this first, where there is something to be `kept`."""
-    global _held
-    _held += bool(kept)
+    """Finish this first, or get to a check, as long as there is something to be `kept`."""
+    _held.append(kept)
     try:
         yield
     finally:
-        _held -= bool(kept)
+        _held.pop()
     check()
