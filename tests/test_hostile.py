@@ -6,12 +6,14 @@ import json
 import lzma
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tarfile
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ import ringfence
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
 from ringfence.datasets.audit import audit
-from ringfence.errors import UserError
+from ringfence.errors import StoreError, UserError
 from ringfence.evaluation import recordings
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
@@ -808,6 +810,43 @@ def test_fields_of_importers_files(name, tmp_path):
         tried(what, read)
     file.write_bytes(raw)
     assert strange_files.sound(read())
+
+
+@pytest.mark.parametrize(
+    ("agents", "options", "said"),
+    [(1000, {}, ""), (3000, {}, "1.1 GiB; let agents see fewer others, .* neighbours"), (3000, {"neighbours": 6}, "")],
+)
+def test_a_small_table_takes_no_large_memory(agents, options, said):
+    """Of everybody's observations of everybody else, which are refused where there are too many."""
+    who, step = np.divmod(np.arange(8 * agents), 8)
+    table = {"t": 0.1 * step, "id": who, "x": 1.0 * who, "y": 1.0 * step}
+    tracemalloc.start()
+    try:
+        EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], **options)
+    except StoreError as error:
+        assert said and re.search(said, str(error))
+    finally:
+        taken = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert taken < (2**27 if said else 2**29)
+
+
+def test_thousands_of_agents_without_others_take_no_large_memory():
+    steps, agents = 12, 3000
+    seen = np.random.default_rng(0).normal(size=(2, steps // 2 + 1, agents, 4))
+    names = ["own.x", "own.y", "goal.dx", "goal.dy"]
+    store = EpisodeStore.from_episodes(
+        seen,
+        np.zeros((2, steps // 2, agents, 1)),
+        np.zeros((2, steps // 2)),
+        np.zeros((2, steps // 2)),
+        card={"task": "many", "observation_names": names},
+    )
+    tracemalloc.start()
+    audit(store)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert taken < 2**26
 
 
 def test_logs_of_thousands_are_looked_at(in_time):

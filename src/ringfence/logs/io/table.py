@@ -30,7 +30,7 @@ from ringfence.logs.io.columns import (
     stacked,
     words,
 )
-from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
+from ringfence.logs.io.episodes import BLOCK, Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.rows import (
     Rows,
@@ -345,6 +345,7 @@ def _arrays(
     named = len(schema.cost) > 1
     ends = np.cumsum(episodes.lengths - 1)
     rows = looked_at(ends)
+    rows = rows[:: 1 + len(rows) * len(episodes.entries) * episodes.rows.shape[1] // BLOCK]
     origins = None
     if not lost and not card.get("observation_origins"):
         before, after = (episodes.seen(episodes.rows[each]) for each in (rows, rows + 1))
