@@ -569,6 +569,38 @@ def test_dates_that_are_written_as_text_are_dates():
         EpisodeStore.from_table(table | {"t": [text[0] + "Z", *text[1:]]}, **NAMES)
 
 
+@pytest.mark.parametrize("entry", ["oops", "", None, "2016-12-31T23:59:60"])
+def test_a_time_that_is_none_is_named_by_its_own_row(entry):
+    table = fleet()
+    first = datetime.datetime(2026, 1, 1, 12)
+    text = [(first + datetime.timedelta(seconds=float(s))).isoformat(timespec="microseconds") for s in table["t"]]
+    wrong = [*text[:37], entry, *text[38:]]
+    with pytest.raises(StoreError, match=f"row 37: t is '{entry}', no time in ISO 8601; repair or drop it"):
+        EpisodeStore.from_table(table | {"t": wrong}, **NAMES)
+    with pytest.raises(StoreError, match=f"row 37: t is '{entry}', no time as time_format=.*; repair or drop it"):
+        EpisodeStore.from_table(table | {"t": wrong}, **NAMES, time_format="%Y-%m-%dT%H:%M:%S.%f")
+    with pytest.raises(StoreError, match="row 0: t is .*, no time as time_format='%d'; say how it is written"):
+        EpisodeStore.from_table(table | {"t": wrong}, **NAMES, time_format="%d")
+
+
+def test_decimal_commas_are_read_wherever_they_stand(tmp_path):
+    import pandas as pd
+
+    table = fleet()
+    commas = table | {name: [f"{x:.17g}".replace(".", ",") for x in table[name]] for name in ("t", "x", "hit")}
+    frame = pd.DataFrame(commas)
+    frame.to_json(tmp_path / "a.jsonl", orient="records", lines=True)
+    frame.to_parquet(tmp_path / "a.parquet")
+    plain = EpisodeStore.from_table(table, **NAMES)
+    for given in (commas, frame, tmp_path / "a.jsonl", tmp_path / "a.parquet"):
+        store = EpisodeStore.from_table(given, **NAMES, decimal=",")
+        np.testing.assert_allclose(store.observations, plain.observations, atol=1e-6)
+    with pytest.raises(StoreError, match="row 3: x is '1.234,5', no number; repair or drop it"):
+        EpisodeStore.from_table(commas | {"x": [*commas["x"][:3], "1.234,5", *commas["x"][4:]]}, **NAMES, decimal=",")
+    ids = commas | {"id": [x.replace("robot", "1,") for x in table["id"]]}
+    assert EpisodeStore.from_table(ids, **NAMES, decimal=",").card.agents == ["1,0", "1,1", "1,2"]
+
+
 def test_an_end_inside_a_track_ends_an_episode():
     """Trips that follow each other, the next from where the first began: no speed is of the way back."""
     steps = 20

@@ -241,7 +241,7 @@ def _columns_of(table: Table, schema: TableSchema, whose: str) -> tuple[Columns,
         columns = {name: read[theirs.get(name, name)] for name in named}
     if schema.join:
         columns[schema.agent] = _after_the_table(whose, columns, schema)
-    columns[schema.time] = dates(columns[schema.time], schema.time_format)
+    columns[schema.time] = dates(schema.time, columns[schema.time], schema.time_format)
     names = entry_names(table)
     return _expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
 

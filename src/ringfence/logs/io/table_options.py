@@ -63,7 +63,7 @@ class Written:
     header: tuple[str, ...] = ()
     """names of the columns of a text file without a head; its lines that begin with # are left out."""
     decimal: Literal[".", ","] = "."
-    """what a CSV file writes for a decimal point."""
+    """what text writes for a decimal point."""
     time_format: str | None = None
     """how times are written as text, e.g. "%d/%m/%Y %H:%M:%S"; ISO 8601 needs none."""
     project: Literal["utm", "none"] | None = None
