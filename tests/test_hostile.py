@@ -25,12 +25,17 @@ import ringfence
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
 from ringfence.datasets.audit import audit
+from ringfence.deploy.controller import Controller
+from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import StoreError, UserError
 from ringfence.evaluation import recordings
+from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
 from ringfence.loading.resolve import load
+from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.constraints import Separation, SpeedLimit
 from ringfence.report import board
 from ringfence.report.pooling import normal_return
 from ringfence.report.table import sections
@@ -905,6 +910,40 @@ def test_things_of_other_kinds_are_refused_by_name(value, tmp_path):
         with pytest.raises(UserError) as refused:
             ask()
         assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize("value", [5, 1.5, [], b"x"], ids=repr)
+def test_things_of_other_kinds_are_refused_beside_a_run(value, trained_run, tmp_path):
+    store, simulator, run = corpus.small_store(), SimpleSpreadParallel, trained_run
+    asked = {
+        **{name: lambda name=name: Controller(run, **{name: value}) for name in ("guard", "planner", "certificate")},
+        "world": lambda: Controller(run, guard="shield", world=value),
+        "Certificate": lambda: Certificate.load(value),
+        "Run": lambda: Run(value),
+        "digest": lambda: store.digest(value),
+        "state": lambda: observe(store.card, value),
+        "card": lambda: observe(value, {"x": [1.0]}),
+        "radius": lambda: Separation(value if value not in (5, 1.5) else "a"),
+        "limit": lambda: SpeedLimit(value if value not in (5, 1.5) else None),
+        "chunk": lambda: ringfence.train("bc", store, chunk=value if value != 5 else "a", out=tmp_path),
+        "out": lambda: ringfence.train("bc", store, out=value),
+        "changes": lambda: ringfence.train("bc", store, changes=value or 5, out=tmp_path),
+        "ope": lambda: ringfence.ope(run, value),
+        "faults": lambda: ringfence.play(run, simulator, faults=value or 5),
+        "split": lambda: ringfence.play(run, simulator, split=value),
+        "cost": lambda: ringfence.play(run, simulator, episodes=1, cost=value),
+        **{
+            f"play {name}": lambda name=name: ringfence.play(run, simulator, **{name: value})
+            for name in ("guard", "world")
+        },
+        "stress": lambda: ringfence.stress(run, {"delay": 1}, make_env=simulator, planner=value),
+        "certify": lambda: ringfence.certify(run, make_env=simulator, guard=value),
+        "replay": lambda: ringfence.replay(run, store, planner=value, faults={}),
+    }
+    for name, ask in asked.items():
+        with pytest.raises(UserError) as refused:
+            ask()
+        assert str(refused.value).isprintable(), name
 
 
 def test_a_card_of_several_agents_is_of_no_split_team():

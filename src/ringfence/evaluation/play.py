@@ -124,8 +124,7 @@ def _check_sizes(episodes: int, num_envs: int, seed: int, max_episode_steps: int
 
 def _check_choices(early_ends: str, split: str) -> None:
     known("early_ends", early_ends, EARLY_ENDS)
-    if split not in RESETS:
-        raise UserError(f"split='{split}' does not exist; use test or validation.")
+    known("split", split, RESETS)
 
 
 def _compensated(run: Run | str | HasPolicy, faults: Faults, options: dict[str, Any]) -> dict[str, Any]:

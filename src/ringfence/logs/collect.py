@@ -16,7 +16,7 @@ from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, is_vector, made
 from ringfence.envs.padded import PaddedEnv
 from ringfence.envs.rollout import Memoryless, Moment, rollout
 from ringfence.envs.side_by_side import SideBySide
-from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
+from ringfence.errors import Interrupted, StoreError, UserError, known, of_kind, whole_number
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
@@ -67,8 +67,7 @@ def collect(
     whole_number("max_episode_steps", max_episode_steps, 1)
     given_card(card)
     file = None if out is None else writable(out)
-    if cost is not None and not callable(cost):
-        raise UserError(f"cost is a {type(cost).__name__}; give a function of the infos of a step.")
+    of_kind("cost", cost, Callable | None, "give a function of the infos of a step")
     env = made(make_env, "action_space")
     player = _Player.of(policy)
     if file is not None:
