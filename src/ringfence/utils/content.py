@@ -114,8 +114,8 @@ def _of_instance(value: Any, installed: bool) -> Iterable[Any]:
     attributes = object.__getstate__(value)
     held: Iterable[Any] = ()
     with suppress(Exception):
-        copied = copyreg.dispatch_table.get(kind, operator.methodcaller("__reduce_ex__", 2))(value)
-        held = () if isinstance(copied, str) else [list(x) if hasattr(x, "__next__") else x for x in copied]
+        copied: Any = copyreg.dispatch_table.get(kind, operator.methodcaller("__reduce_ex__", 2))(value)
+        held = () if isinstance(copied, str) else [list(x) if isinstance(x, Iterator) else x for x in copied]
     told = held or (attributes and not isinstance(value, io.IOBase))
     bare = all(base is object or not _is_installed(base.__module__) for base in kind.__mro__)
     return kind, *held, None if held and installed else attributes, *(() if told or bare else [CLOSED])

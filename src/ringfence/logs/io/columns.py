@@ -103,13 +103,14 @@ def dates(name: str, column: np.ndarray, written: str | None = None) -> np.ndarr
     with an offset are counted in UTC, and a column in which some have one is left to be refused."""
     if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
         return column
-    found = [_date(entry, written) for entry in column.tolist()]
-    wrong = [row for row, one in enumerate(found) if one is None]
-    if len(wrong) == len(found) and written is None:
+    read = [_date(entry, written) for entry in column.tolist()]
+    wrong = [row for row, one in enumerate(read) if one is None]
+    found = [one for one in read if one is not None]
+    if not found and written is None:
         return column
     if wrong:
         form = "in ISO 8601" if written is None else f"as time_format='{written}'"
-        remedy = "repair or drop it" if len(wrong) < len(found) else "say how it is written"
+        remedy = "repair or drop it" if found else "say how it is written"
         raise StoreError(f"row {wrong[0]}: {name} is {str(column[wrong[0]])[:40]!r}, no time {form}; {remedy}.")
     if len({one.tzinfo is None for one in found}) > 1:
         return column

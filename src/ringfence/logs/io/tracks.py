@@ -93,10 +93,11 @@ def unrounded(rows: Rows) -> tuple[Rows, list[str]]:
         parts = [
             _ticks(rows.time[here], step, unit) for here in np.split(order, np.flatnonzero(np.diff(whose[order])) + 1)
         ]
-        if any(part is None for part in parts):
+        found = [part for part in parts if part is not None]
+        if len(found) < len(parts):
             continue
         time = np.empty(len(order))
-        time[order] = np.concatenate(parts)
+        time[order] = np.concatenate(found)
         if (np.diff(time)[rows.follows] > 0).all():
             said = f"times are rounded to {unit:.3g} s: rows are at those of the clock of {step:.6g} s that fits them"
             return replace(rows, time=time), [said]
