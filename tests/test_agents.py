@@ -88,7 +88,15 @@ def test_a_team_whose_members_change_names_nobody():
     kept = ((rows["id"] != "c") & early) | ((rows["id"] != "a") & ~early)
     store = EpisodeStore.from_table({name: column[kept] for name, column in rows.items()}, **NAMES, team=2)
     assert store.n_agents == 2 and store.card.agents is None
-    alone = EpisodeStore.from_table(rows, **NAMES, neighbours=1)
+    assert [places(store), places(store.select(np.arange(store.episodes) == 1))] == [[0.0, 1.0], [2.0, 1.0]]  # b stays
+    said = "the team changes its members: who comes is seen where somebody left"
+    assert said in store.card.warnings
+    rows["run"] = (10 * rows["t"]).astype(int) // 10
+    kept = rows["id"] != np.array(["c", "a", "b"])[rows["run"]]
+    store = EpisodeStore.from_table({name: x[kept] for name, x in rows.items()}, **NAMES, episode="run", gap=0.2)
+    assert [places(store.select(np.arange(3) == k)) for k in range(3)] == [[0.0, 1.0], [2.0, 1.0], [2.0, 0.0]]
+    assert f"{said}, and so a change places" in store.card.warnings
+    alone = EpisodeStore.from_table(table(["a", "b", "c"]), **NAMES, neighbours=1)
     assert alone.card.agents is None
 
 

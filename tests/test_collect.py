@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import warnings
-from functools import partial
+from functools import partial, update_wrapper
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import ringfence
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.store import EpisodeStore
+from ringfence.utils.content import content_of
 from ringfence.utils.progress import Progress
 
 
@@ -181,6 +183,95 @@ def test_what_else_makes_another_recording(tmp_path, monkeypatch):
     monkeypatch.setitem(reading.__globals__, "READ", np.array([0.5]))
     with pytest.raises(StoreError, match="of a policy"):
         ringfence.collect(lambda: Faster(1.0), reading, episodes=2, out=tmp_path / "e.h5")
+
+
+class Row(NamedTuple):
+    strength: float
+
+    def __call__(self, observations):
+        return np.full((2, 1), self.strength)
+
+
+class Listed(list):
+    __call__ = Pushing.__call__
+
+
+class Shown(Pushing):
+    def __array__(self, dtype=None, copy=None):
+        return np.zeros(2)
+
+
+class Uncopied(Pushing):
+    __reduce_ex__ = None
+
+
+def told(kind):
+    """Whose strength stands beside what it holds or wraps."""
+
+    def make(strength):
+        made = kind()
+        made.strength = strength
+        return made
+
+    return make
+
+
+def wrapping(strength):
+    return update_wrapper(Pushing(strength), reading)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [Row, told(Listed), Shown, Uncopied, wrapping, lambda s: update_wrapper(partial(pushed, s), reading)]
+    + [lambda s: {"act": np.full((2, 1), s)}.get, lambda s: np.frompyfunc(pushing(s), 1, 1)],
+)
+def test_whatever_holds_it_a_value_is_compared(make):
+    assert content_of(make(0.25)) != content_of(make(0.5)) or " " in content_of(make(0.5))
+    assert content_of(make(0.25)) == content_of(make(0.25))
+
+
+def test_modules_of_ones_own_are_compared(tmp_path, monkeypatch):
+    """Whatever they hold, and those that code imports as it runs; of installed ones the name counts."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_gain.py").write_text("GAIN = 0.25")
+    (tmp_path / "own_control.py").write_text(
+        "from math import pi\ndef act(x):\n import own_gain\n return own_gain.GAIN"
+    )
+    import own_control
+
+    def policy(observations):
+        return np.full((2, 1), own_control.act(observations))
+
+    first, file = content_of(policy), tmp_path / "d.h5"
+    ringfence.collect(Drift, policy, episodes=2, out=file)
+    assert content_of(policy) == first
+    monkeypatch.setattr(sys.modules["own_gain"], "GAIN", 0.5)
+    with pytest.raises(StoreError, match="of a policy whose code or values differ"):
+        ringfence.collect(Drift, policy, episodes=2, out=file)
+    monkeypatch.undo()
+    monkeypatch.setattr(own_control, "pi", 3)
+    assert content_of(policy) != first
+    monkeypatch.setattr(np, "pi", 3)
+    assert content_of(lambda observations: np.pi) == content_of(lambda observations: np.pi)
+
+
+def test_what_cannot_be_compared_is_not_believed(tmp_path):
+    endless = (np.full((2, 1), 0.25) for _ in iter(int, 1))
+    ringfence.collect(Drift, lambda observations: next(endless), episodes=2, out=tmp_path / "d.h5")
+    with pytest.raises(StoreError, match="since a policy with a builtins.generator cannot be compared; delete it"):
+        ringfence.collect(Drift, lambda observations: next(endless), episodes=2, out=tmp_path / "d.h5")
+
+
+def test_another_card_or_end_is_another_recording(tmp_path):
+    first = {"task": "drift", "dt": 0.1}
+    ringfence.collect(Drift, episodes=2, out=tmp_path / "d.h5", card=first)
+    with pytest.raises(StoreError, match="of a card whose code or values differ"):
+        ringfence.collect(Drift, episodes=3, out=tmp_path / "d.h5", card=first | {"dt": 0.2})
+    for _ in range(2):  # a refusal of early ends leaves none, so it may go on in any way
+        assert ringfence.collect(Drift, episodes=2, out=tmp_path / "d.h5", card=first, early_ends="cut").episodes == 2
+        ringfence.collect(Drift, episodes=3, out=tmp_path / "d.h5", card=first, early_ends="cut")
+    with pytest.raises(StoreError, match="early_ends='cut', not .* early_ends='refuse'"):
+        ringfence.collect(Drift, episodes=3, out=tmp_path / "d.h5", card=first)
 
 
 def test_another_process_finds_the_same_content(tmp_path):

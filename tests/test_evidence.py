@@ -1,5 +1,6 @@
 """The log of a controller, and what tells that it was changed."""
 
+import errno
 import hashlib
 import importlib.util
 import os
@@ -12,6 +13,7 @@ import pytest
 from ringfence.cli.app import main
 from ringfence.deploy import zoo
 from ringfence.deploy.controller import Controller
+from ringfence.deploy.evidence import Evidence
 from ringfence.envs import Crossing
 from ringfence.errors import NoSafeAction, UserError
 from ringfence.evaluation.certificate import digest
@@ -30,6 +32,21 @@ def written(tmp_path):
     log.add({"kind": "end"})
     log.close()
     return tmp_path / "run.log"
+
+
+@pytest.mark.parametrize("at", ["begin", "end"])
+def test_a_log_on_a_full_disk_is_given_back(at, tmp_path, monkeypatch):
+    begun = None if at == "begin" else Evidence(tmp_path / "run.log", None, 2, None)
+
+    def full(file, line):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "write", full)
+        with pytest.raises(UserError, match="free some space"):
+            begun.close() if begun else Evidence(tmp_path / "run.log", None, 2, None)
+    Evidence(tmp_path / "run.log", None, 2, None).close()
+    assert check(tmp_path / "run.log").ended
 
 
 def test_a_log_says_what_was_written_and_goes_on(written):

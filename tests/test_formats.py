@@ -517,6 +517,26 @@ def test_several_files_with_episodes_of_their_own():
         EpisodeStore.from_table([parts[0], dates], **schema)
 
 
+def test_agents_of_joined_files_are_called_after_what_tells_the_files_apart(tmp_path):
+    import pandas as pd
+
+    frame = pd.DataFrame(track(40)).query("id == 0").drop(columns="id")
+    files = [tmp_path / folder / name for folder in ("r1", "r2") for name in ("pose.csv", "pose.jsonl")]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        frame.to_csv(file, index=False) if file.suffix == ".csv" else frame.to_json(file, orient="records", lines=True)
+    schema = {"time": "t", "agent": "id", "state": ["x", "y"], "join": True}
+    for given, agents in (
+        (files[::2], ["r1/pose", "r2/pose"]),
+        (files[:2], ["pose.csv", "pose.jsonl"]),
+        (files[:3], ["r1/pose.csv", "r1/pose.jsonl", "r2/pose.csv"]),
+        ([frame, files[0]], ["0", "pose"]),
+    ):
+        assert EpisodeStore.from_table(given, **schema).card.agents == agents
+    with pytest.raises(UserError, match="pose.csv' is given twice"):
+        EpisodeStore.from_table([files[0], tmp_path / "r2" / ".." / "r1" / "pose.csv"], **schema)
+
+
 def test_drones_telemetry_is_read_as_it_is(tmp_path):
     """SynDrone-Swarm: a row per drone and frame, at times that jitter; z is down."""
     head = "ScenarioID,DroneID,Frame,Time,X,Y,Z,Vel,VelX,VelY,VelZ,Roll,Pitch,Yaw,Role,Intent,Target,IsObserver,TimeStr"
@@ -606,6 +626,46 @@ def test_degrees_are_no_metres(tmp_path):
     ):
         with pytest.raises(UserError, match=said):
             EpisodeStore.from_table(table, **{**ALONE, "rename": names, "project": "utm", **options})
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "remedy"),
+    [
+        ("x_cm", r"in cm by its name.* scale of x \(--scale x=...\) 0.01, or 1", {"scale": {"x": 0.01}}),
+        ("xMm", "in mm by its name", {"scale": {"x": 0.001}}),
+        ("Local X (feet)", "in feet by its name.* 0.3048", {"scale": {"x": 0.3048}}),
+        ("x_px", "in px by its name.* the metres of one", {"scale": {"x": 0.05}}),
+        ("x_deg", "in degrees by its name.* project='utm'", {"project": "none"}),
+        ("timestamp_ms", r"counts ms by its name.* time_unit \(--time-unit\) 0.001, or 1", {"time_unit": 0.001}),
+        ("time [µs]", "counts µs by its name", {"time_unit": 1.0}),
+        ("FrameId", "counts frame by its name.* the seconds of one", {"time_unit": 0.04}),
+        ("vx_km_h", "in kmh by its name.* 0.277778", {"scale": {"vx": 1 / 3.6}}),
+        ("yaw_deg", "in degrees by its name; call it yaw_deg", {"scale": {"yaw": np.pi / 180}}),
+    ],
+)
+def test_units_that_names_tell_are_asked_for(name, said, remedy):
+    table = track(40) | {"vx": track(40)["y"], "yaw": track(40)["y"]}
+    ours = (
+        "t" if "t" == name[0].lower() or "Frame" in name else next(x for x in ("vx", "yaw", "x") if x in name.lower())
+    )
+    table[name] = table.pop(ours)
+    how = {"time": "t", "agent": "id", "state": ["x", "y", "vx", "yaw"], "rename": {name: ours}}
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.from_table(table, **how)
+    EpisodeStore.from_table(table, **how, **remedy, max_speed=1e6)
+
+
+def test_names_that_hold_no_unit_are_left_alone():
+    table = track(40)
+    for x, y, t in (
+        ("px", "py", "t"),
+        ("robot_px", "robot_py", "Timestamp"),
+        ("x_m", "y_m", "time_s"),
+        ("cm", "mm", "t"),
+    ):
+        given = {x: table["x"], y: table["y"], t: table["t"], "id": table["id"]}
+        how = {"time": t, "agent": "id", "state": ["x", "y"], "rename": {x: "x", y: "y"}}
+        assert EpisodeStore.from_table(given, **how).steps == 39
 
 
 @pytest.mark.parametrize(

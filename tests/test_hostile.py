@@ -6,11 +6,14 @@ import json
 import lzma
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tarfile
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +25,17 @@ import ringfence
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
 from ringfence.datasets.audit import audit
-from ringfence.errors import UserError
+from ringfence.deploy.controller import Controller
+from ringfence.envs.pettingzoo import SimpleSpreadParallel
+from ringfence.errors import StoreError, UserError
 from ringfence.evaluation import recordings
+from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
 from ringfence.loading.resolve import load
+from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.constraints import Separation, SpeedLimit
 from ringfence.report import board
 from ringfence.report.pooling import normal_return
 from ringfence.report.table import sections
@@ -317,6 +325,41 @@ def test_ctrl_c_is_not_swallowed():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split() == ["heard", "finished", "heard"]
+
+
+@pytest.mark.parametrize(
+    ("within", "presses", "seconds"),
+    [
+        ("time.sleep(60)", 1, (1.5, 20)),
+        ("np.linalg.svd(np.ones((4000, 4000)))", 1, (1.5, 40)),  # which hears no signal
+        ("time.sleep(60)", 2, (0, 20)),
+        ("with interrupts.held(): time.sleep(60)", 2, (0, 20)),
+        ("with interrupts.held(): time.sleep(4)", 1, (3.5, 20)),
+        ("with interrupts.held(False): time.sleep(60)", 1, (1.5, 20)),
+        ("interrupts.check()", 1, (0, 20)),
+    ],
+)
+def test_ctrl_c_ends_what_does_not_hear_it_and_leaves_nothing_half_written(within, presses, seconds, tmp_path):
+    code = (
+        "import signal, sys, threading, time\nimport numpy as np\nfrom ringfence.cli import app\n"
+        "from ringfence.__main__ import main\nfrom ringfence.utils import interrupts\n"
+        "from ringfence.utils.files import whole\n"
+        "class Freed:\n    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
+        "def press():\n    time.sleep(0.7)\n    signal.raise_signal(signal.SIGINT)\n"
+        f"def command():\n    with whole({str(tmp_path / 'a.txt')!r}) as part:\n        part.write_text('half')\n"
+        f"        Freed()\n        if {presses} > 1: threading.Thread(target=press).start()\n"
+        f"        {within}\n"
+        "app.COMMANDS['tasks'] = command\nsys.argv[1:] = ['tasks']\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\nprint(flush=True)\nmain()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as asked:
+        asked.stdout.readline()
+        begun = time.monotonic()
+        said = asked.communicate(timeout=60)[1]
+    assert asked.returncode == 130 and "interrupted" in said and "Traceback" not in said
+    assert seconds[0] <= time.monotonic() - begun < seconds[1] and not list(tmp_path.iterdir())
 
 
 SWALLOWED = """
@@ -774,6 +817,43 @@ def test_fields_of_importers_files(name, tmp_path):
     assert strange_files.sound(read())
 
 
+@pytest.mark.parametrize(
+    ("agents", "options", "said"),
+    [(1000, {}, ""), (3000, {}, "1.1 GiB; let agents see fewer others, .* neighbours"), (3000, {"neighbours": 6}, "")],
+)
+def test_a_small_table_takes_no_large_memory(agents, options, said):
+    """Of everybody's observations of everybody else, which are refused where there are too many."""
+    who, step = np.divmod(np.arange(8 * agents), 8)
+    table = {"t": 0.1 * step, "id": who, "x": 1.0 * who, "y": 1.0 * step}
+    tracemalloc.start()
+    try:
+        EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], **options)
+    except StoreError as error:
+        assert said and re.search(said, str(error))
+    finally:
+        taken = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert taken < (2**27 if said else 2**29)
+
+
+def test_thousands_of_agents_without_others_take_no_large_memory():
+    steps, agents = 12, 3000
+    seen = np.random.default_rng(0).normal(size=(2, steps // 2 + 1, agents, 4))
+    names = ["own.x", "own.y", "goal.dx", "goal.dy"]
+    store = EpisodeStore.from_episodes(
+        seen,
+        np.zeros((2, steps // 2, agents, 1)),
+        np.zeros((2, steps // 2)),
+        np.zeros((2, steps // 2)),
+        card={"task": "many", "observation_names": names},
+    )
+    tracemalloc.start()
+    audit(store)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert taken < 2**26
+
+
 def test_logs_of_thousands_are_looked_at(in_time):
     rng = np.random.default_rng(0)
 
@@ -830,6 +910,40 @@ def test_things_of_other_kinds_are_refused_by_name(value, tmp_path):
         with pytest.raises(UserError) as refused:
             ask()
         assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize("value", [5, 1.5, [], b"x"], ids=repr)
+def test_things_of_other_kinds_are_refused_beside_a_run(value, trained_run, tmp_path):
+    store, simulator, run = corpus.small_store(), SimpleSpreadParallel, trained_run
+    asked = {
+        **{name: lambda name=name: Controller(run, **{name: value}) for name in ("guard", "planner", "certificate")},
+        "world": lambda: Controller(run, guard="shield", world=value),
+        "Certificate": lambda: Certificate.load(value),
+        "Run": lambda: Run(value),
+        "digest": lambda: store.digest(value),
+        "state": lambda: observe(store.card, value),
+        "card": lambda: observe(value, {"x": [1.0]}),
+        "radius": lambda: Separation(value if value not in (5, 1.5) else "a"),
+        "limit": lambda: SpeedLimit(value if value not in (5, 1.5) else None),
+        "chunk": lambda: ringfence.train("bc", store, chunk=value if value != 5 else "a", out=tmp_path),
+        "out": lambda: ringfence.train("bc", store, out=value),
+        "changes": lambda: ringfence.train("bc", store, changes=value or 5, out=tmp_path),
+        "ope": lambda: ringfence.ope(run, value),
+        "faults": lambda: ringfence.play(run, simulator, faults=value or 5),
+        "split": lambda: ringfence.play(run, simulator, split=value),
+        "cost": lambda: ringfence.play(run, simulator, episodes=1, cost=value),
+        **{
+            f"play {name}": lambda name=name: ringfence.play(run, simulator, **{name: value})
+            for name in ("guard", "world")
+        },
+        "stress": lambda: ringfence.stress(run, {"delay": 1}, make_env=simulator, planner=value),
+        "certify": lambda: ringfence.certify(run, make_env=simulator, guard=value),
+        "replay": lambda: ringfence.replay(run, store, planner=value, faults={}),
+    }
+    for name, ask in asked.items():
+        with pytest.raises(UserError) as refused:
+            ask()
+        assert str(refused.value).isprintable(), name
 
 
 def test_a_card_of_several_agents_is_of_no_split_team():

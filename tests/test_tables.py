@@ -571,6 +571,38 @@ def test_dates_that_are_written_as_text_are_dates():
         EpisodeStore.from_table(table | {"t": [text[0] + "Z", *text[1:]]}, **NAMES)
 
 
+@pytest.mark.parametrize("entry", ["oops", "", None, "2016-12-31T23:59:60"])
+def test_a_time_that_is_none_is_named_by_its_own_row(entry):
+    table = fleet()
+    first = datetime.datetime(2026, 1, 1, 12)
+    text = [(first + datetime.timedelta(seconds=float(s))).isoformat(timespec="microseconds") for s in table["t"]]
+    wrong = [*text[:37], entry, *text[38:]]
+    with pytest.raises(StoreError, match=f"row 37: t is '{entry}', no time in ISO 8601; repair or drop it"):
+        EpisodeStore.from_table(table | {"t": wrong}, **NAMES)
+    with pytest.raises(StoreError, match=f"row 37: t is '{entry}', no time as time_format=.*; repair or drop it"):
+        EpisodeStore.from_table(table | {"t": wrong}, **NAMES, time_format="%Y-%m-%dT%H:%M:%S.%f")
+    with pytest.raises(StoreError, match="row 0: t is .*, no time as time_format='%d'; say how it is written"):
+        EpisodeStore.from_table(table | {"t": wrong}, **NAMES, time_format="%d")
+
+
+def test_decimal_commas_are_read_wherever_they_stand(tmp_path):
+    import pandas as pd
+
+    table = fleet()
+    commas = table | {name: [f"{x:.17g}".replace(".", ",") for x in table[name]] for name in ("t", "x", "hit")}
+    frame = pd.DataFrame(commas)
+    frame.to_json(tmp_path / "a.jsonl", orient="records", lines=True)
+    frame.to_parquet(tmp_path / "a.parquet")
+    plain = EpisodeStore.from_table(table, **NAMES)
+    for given in (commas, frame, tmp_path / "a.jsonl", tmp_path / "a.parquet"):
+        store = EpisodeStore.from_table(given, **NAMES, decimal=",")
+        np.testing.assert_allclose(store.observations, plain.observations, atol=1e-6)
+    with pytest.raises(StoreError, match="row 3: x is '1.234,5', no number; repair or drop it"):
+        EpisodeStore.from_table(commas | {"x": [*commas["x"][:3], "1.234,5", *commas["x"][4:]]}, **NAMES, decimal=",")
+    ids = commas | {"id": [x.replace("robot", "1,") for x in table["id"]]}
+    assert EpisodeStore.from_table(ids, **NAMES, decimal=",").card.agents == ["1,0", "1,1", "1,2"]
+
+
 def test_an_end_inside_a_track_ends_an_episode():
     """Trips that follow each other, the next from where the first began: no speed is of the way back."""
     steps = 20
@@ -584,6 +616,16 @@ def test_an_end_inside_a_track_ends_an_episode():
         store = EpisodeStore.from_table(table, **options, dt=dt)
         assert np.array_equal(store.episode_ends, ends) and store.episode_terminated.all()
         assert np.ptp(entry(store, "own.vx")) < 1e-3  # never -950 m/s, which a seam would be
+    flagged = table["end"] & (table["id"] == 0)  # by one of the team alone
+    for late in (0.0, 0.02):
+        alone = table | {"end": flagged, "t": table["t"] + late * table["id"]}
+        store = EpisodeStore.from_table(alone, **options)
+        assert np.ptp(entry(store, "own.vx")) < 1e-3 and store.episodes == 2 and store.episode_terminated.all()
+    left = {
+        name: column[(table["id"] == 0) | (table["t"] < 0.65) | (table["t"] > 2.95)] for name, column in table.items()
+    }
+    store = EpisodeStore.from_table(left | {"end": left["end"] & (left["id"] == 0)}, **options)
+    assert store.episode_terminated.tolist() == [False, True]  # who left before did not end there
     one = EpisodeStore.from_table(table, **options, neighbours=1)
     assert one.episodes == 4 and one.episode_terminated.all()
     with pytest.raises(StoreError, match="moved at"):
@@ -636,6 +678,43 @@ def test_no_row_slips_however_long_or_wrong_the_clock(times, options, dt):
     assert len(drifts) == (dt is None or "dt" in options)
 
 
+@pytest.mark.parametrize(
+    ("dt", "many", "rounded"),
+    [
+        (1 / 60, 30_000, lambda t: np.round(t, 3)),
+        (1 / 60, 30_000, lambda t: np.floor(t * 100) / 100),
+        (1 / 60, 30_000, lambda t: 1.7e9 + np.round(t, 3)),
+        (1 / 60, 60, lambda t: np.round(t, 3)),
+        (0.01, 20_000, lambda t: (1e5 + t).astype(np.float32)),
+        (0.01, 20_000, lambda t: (1e4 + t).astype(np.float32)),
+        (0.75, 30_000, lambda t: np.round(t, 1)),
+    ],
+)
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_rounded_times_are_those_that_they_were_rounded_from(dt, many, rounded, late):
+    """Of agents that share a clock, and of two that do not."""
+    k = np.arange(many)
+    times, other = rounded(k * dt), rounded((k + late) * dt)
+    table = {
+        "t": np.r_[times, other],
+        "id": np.repeat([0, 1], many),
+        "x": np.tile(k * dt, 2),
+        "hit": np.zeros(2 * many),
+    }
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x"], cost="hit")
+    assert abs(store.card.dt / dt - 1) < 2e-5 and abs(store.steps - many) <= 2
+    assert not any("drifts" in note for note in store.card.warnings)
+    assert any("times are rounded to" in note for note in store.card.warnings)
+    assert np.abs(np.diff(entry(store, "own.x"), axis=0) / dt - 1).max() < 0.03
+
+
+def test_rows_that_are_lost_do_not_make_another_clock():
+    chance = np.random.default_rng(0)
+    for kept in (np.delete(ROWS, [40, 90]), np.sort(chance.permutation(ROWS)[:24_000]), ROWS[ROWS % 10 > 0]):
+        store, _ = clocked(kept * 0.1)
+        assert store.card.dt == 0.1 and not any("rounded" in note for note in store.card.warnings)
+
+
 def test_times_without_a_clock_are_not_counted_by_rows():
     """Two rates that are far apart, and none: states are where they were at that time."""
     two = np.cumsum(np.where(ROWS[:4000] < 2000, 0.1, 0.115))
@@ -656,6 +735,12 @@ def test_events_keep_their_sum_whatever_the_steps():
         store = EpisodeStore.from_table(table, **options, dt=dt)
         assert store.costs.sum() == 1 and store.rewards.sum() == len(t) - 1
         assert np.isclose((np.flatnonzero(store.costs)[0] + 1) * store.card.dt, at)
+    after = table | {"hit": np.isclose(t, 1.5) * 1.0}  # of the hole, which is longer than the gap
+    said = "1 episodes begin with a row that costs something, which no step leads to: that cost is left out"
+    for pieces in ({}, {"max_episode_steps": 5, "min_episode_steps": 1}):
+        store = EpisodeStore.from_table(after, **options, gap=0.3, **pieces)
+        assert store.costs.sum() == 0 and sum(note.startswith(said) for note in store.card.warnings) == 1
+    assert not any("begin with" in note for note in EpisodeStore.from_table(after, **options, gap=1.0).card.warnings)
     lasts = table | {"hit": ((t > 0.85) & (t < 2.05)) * 1.0}
     store = EpisodeStore.from_table(lasts, **options)
     assert store.costs.sum() == lasts["hit"].sum()  # danger on both sides of the hole is danger in it

@@ -20,6 +20,7 @@ from typing import IO
 from ringfence.bench.cells import Cell, Grid, record_failure, tell_lost
 from ringfence.bench.worker import decode, encode
 from ringfence.errors import UserError
+from ringfence.utils import interrupts
 from ringfence.utils.files import owned
 from ringfence.utils.progress import Progress
 
@@ -67,6 +68,7 @@ def run_local(
                 for hand in hands:
                     while hand.is_alive():
                         hand.join(0.2)
+                        interrupts.check()
             except KeyboardInterrupt:
                 pool.stop()
                 for hand in hands:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
-from ringfence.errors import UserError
+from ringfence.errors import SHOWN, UserError
 from ringfence.logs.late import late_actions
 from ringfence.logs.resolution import coarse
 from ringfence.logs.store import EpisodeStore
@@ -195,7 +195,7 @@ def odd_actions(store: EpisodeStore) -> list[str]:
     """Warnings of agents who never act in another way, of whom nobody learns what actions do, of entries that agents
     use and do not have, and of bounds that the logs use on one side alone: a guard would search where nobody acted."""
     still = np.flatnonzero((np.ptp(store.actions, 0) == 0).all(-1))
-    who = ", ".join(map(str, still))
+    who = ", ".join(map(str, still[:SHOWN])) + ", ..." * (len(still) > SHOWN)
     return [
         *([f"Actions of agent {who} never vary: no World can learn what they do."] if len(still) else []),
         *_spare(store),

@@ -30,7 +30,11 @@ class Evidence:
         guarded = guarded_of(policy)
         self._parts = () if guarded is None else guarded.guard.barrier.part_names
         self._log = ChainedLog(path)
-        self._log.add(_begun(policy, guarded, agents, certificate))
+        try:
+            self._log.add(_begun(policy, guarded, agents, certificate))
+        except BaseException:
+            self._log.close()
+            raise
 
     @property
     def last(self) -> str:
@@ -79,8 +83,10 @@ class Evidence:
 
     def close(self) -> None:
         """End the log; what stopped without it was killed."""
-        self._log.add({"kind": "end", "t": _now()})
-        self._log.close()
+        try:
+            self._log.add({"kind": "end", "t": _now()})
+        finally:  # on a full disk, too
+            self._log.close()
 
     def _corrected(self, action: np.ndarray, info: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
         """Of each agent whose action is another than it requested: that one, and the worst along its plan."""

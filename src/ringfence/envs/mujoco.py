@@ -33,7 +33,6 @@ from ringfence.errors import UserError, unknown
 from ringfence.problem.features import VIEWS, FeatureMap, Source
 from ringfence.problem.others import others
 from ringfence.types import Array
-from ringfence.utils import interrupts
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -401,15 +400,13 @@ class _Batch:
         self._batch.reset(ids=ids, stage=0)
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
-        with interrupts.held():
-            self._batch.forward(ids=ids)
+        self._batch.forward(ids=ids)
         self.warmstart[ids] = warmstart
 
     def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
         if len(live):
             self._ctrl[:] = ctrl
-            with interrupts.held():
-                self._batch.step(ids=live, nstep=FRAME_SKIP)
+            self._batch.step(ids=live, nstep=FRAME_SKIP)
 
 
 class _Loop:
@@ -449,8 +446,7 @@ class _Loop:
         if self._pool is None:
             run(live)
         else:
-            with interrupts.held():
-                list(self._pool.map(run, np.array_split(live, self._threads)))
+            list(self._pool.map(run, np.array_split(live, self._threads)))
 
     def _read(self, k: int) -> None:
         data = self._data[k]

@@ -12,6 +12,7 @@ import numpy as np
 
 from ringfence.envs.base import Env, Outcome, PureEnv, Seen
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree, Transition, act_with, with_cost
+from ringfence.utils import interrupts
 
 
 class Moment(NamedTuple):
@@ -39,6 +40,7 @@ def rollout(policy: Policy, env: Env, watch: Watch, keys: Iterator[Any]) -> None
     carry = policy.initial_state(len(env.running))
     before = env.observe()
     while env.running.any() and (key := next(keys, None)) is not None:
+        interrupts.check()
         running = env.running.copy()
         carry, decided = act_with(policy, carry, *before, key)
         outcome = env.step(np.asarray(decided.action))

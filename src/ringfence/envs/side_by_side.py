@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.envs.base import Outcome, Seen
 from ringfence.envs.episode import Cost, Episode, Shape
-from ringfence.errors import UserError
+from ringfence.errors import UserError, of_kind
 
 Charge = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 
@@ -30,6 +30,9 @@ class SideBySide:
     cost: Cost | None = None
     charge: Charge | None = None
     episodes: list[Episode] = field(default_factory=list)
+
+    def __post_init__(self):
+        of_kind("cost", self.cost, Callable | None, "give a function of the infos of a step")
 
     @property
     def running(self) -> np.ndarray:

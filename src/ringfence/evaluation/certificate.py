@@ -23,7 +23,7 @@ from ringfence.guards.options import GuardOptions
 from ringfence.loading.spec import SOURCES
 from ringfence.utils import schemas
 from ringfence.utils.config import build_config, fields_of
-from ringfence.utils.files import whole
+from ringfence.utils.files import place, whole
 from ringfence.utils.pytrees import digest_of, named_arrays
 
 FORMAT = 2
@@ -122,8 +122,9 @@ class Certificate:
     @classmethod
     def load(cls, path: str | Path) -> Certificate:
         """What `save` wrote; anything else is refused, and so is what its own counts contradict."""
+        path = place(path)
         try:
-            stored = schemas.decode(schemas.content(Path(path), LARGEST), dict[str, Any])
+            stored = schemas.decode(schemas.content(path, LARGEST), dict[str, Any])
             if stored.get("format") != FORMAT:
                 raise ValueError(f"it has format {str(stored.get('format'))[:20]}, and this version reads {FORMAT}")
             if stored.pop("digest", None) != _digest_of_words(stored):

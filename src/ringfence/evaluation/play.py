@@ -26,6 +26,7 @@ from ringfence.problem.bounds import Bounds
 from ringfence.problem.names import Names
 from ringfence.training.runs import Run
 from ringfence.types import Key
+from ringfence.utils import interrupts
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
@@ -90,7 +91,7 @@ def play(
     played: list[Episode] = []
     watches, watch_of = watching(_names_of(player, first), len(env.envs)) if keep else ([], lambda: nobody)
     try:
-        with Progress(f"{player.name} in {type(first).__name__}", episodes, 0, quiet) as bar:
+        with Progress(f"{player.name} in {type(first).__name__}", episodes, 0, quiet) as bar, interrupts.held(played):
             resets = range(RESETS[split], RESETS[split] + episodes)
             play_all(player, env, resets, jax.random.key(seed), bar, played, watch_of)
     except UserError as error:
@@ -123,8 +124,7 @@ def _check_sizes(episodes: int, num_envs: int, seed: int, max_episode_steps: int
 
 def _check_choices(early_ends: str, split: str) -> None:
     known("early_ends", early_ends, EARLY_ENDS)
-    if split not in RESETS:
-        raise UserError(f"split='{split}' does not exist; use test or validation.")
+    known("split", split, RESETS)
 
 
 def _compensated(run: Run | str | HasPolicy, faults: Faults, options: dict[str, Any]) -> dict[str, Any]:

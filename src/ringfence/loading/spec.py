@@ -18,6 +18,7 @@ from ringfence.loading.oracle import ORACLE
 from ringfence.proposals.options import DEFAULT, PLANNERS, PlanOptions
 from ringfence.training.runs import Run
 from ringfence.utils.config import fields_of, read_text
+from ringfence.utils.files import place
 from ringfence.world import World
 
 EXECUTIONS = ("centralized", "decentralized")
@@ -82,7 +83,7 @@ class PolicySpec:
             guard_options=_options(GuardOptions, of_guard),
             barrier=barrier or "learned",
             execution=execution,
-            world=world if world is None or isinstance(world, World) else Path(world),
+            world=world if world is None or isinstance(world, World) else place(world),
             agents=agents,
             anyway=anyway,
         )
@@ -172,8 +173,8 @@ def _by_owner(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any
 
 
 def _known(kind: str, name: Any, known: Any) -> None:
-    if name not in known:
-        raise unknown(kind, str(name), known)
+    if not isinstance(name, str) or name not in known:
+        raise unknown(kind, name, known)
 
 
 def _options(kind: type, given: Mapping[str, Any]) -> Options:

@@ -16,12 +16,13 @@ from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, is_vector, made
 from ringfence.envs.padded import PaddedEnv
 from ringfence.envs.rollout import Memoryless, Moment, rollout
 from ringfence.envs.side_by_side import SideBySide
-from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
+from ringfence.errors import Interrupted, StoreError, UserError, known, of_kind, whole_number
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
+from ringfence.utils import interrupts
 from ringfence.utils.content import content_of
 from ringfence.utils.files import writable
 from ringfence.utils.functions import of_both
@@ -53,9 +54,10 @@ def collect(
     there are none, 0. A dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0
     by default).
 
-    With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy, cost
-    and seed goes on from there; so does one that was refused or interrupted, since what was finished is kept. The same
-    are those of the same code and values; a policy that changes as it acts tells them by an attribute `made_of`.
+    With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy, cost,
+    card and seed goes on from there; so does one that was refused or interrupted, since what was finished is kept. The
+    same are those of the same code and values, that of one's own modules included; what tells nothing of what it holds
+    is never the same, and a policy that changes as it acts tells it by an attribute `made_of`.
     `max_episode_steps` without an end are refused. `early_ends` says what becomes of an episode that an agent leaves
     before its team: it is refused, cut there, or skipped and counted on the card. `card` adds fields to the store's.
     """
@@ -65,17 +67,19 @@ def collect(
     whole_number("max_episode_steps", max_episode_steps, 1)
     given_card(card)
     file = None if out is None else writable(out)
-    if cost is not None and not callable(cost):
-        raise UserError(f"cost is a {type(cost).__name__}; give a function of the infos of a step.")
+    of_kind("cost", cost, Callable | None, "give a function of the infos of a step")
     env = made(make_env, "action_space")
     player = _Player.of(policy)
     if file is not None:
         player.reset()  # what it remembers of other episodes is none of what it is made of
+    simulated = make_env, type(env), type(getattr(env, "unwrapped", env))
+    made_of = {"simulator": simulated, "policy": policy, "cost": cost, "card": sorted((card or {}).items())}
     source = {
         "simulator": _called(env),
         "policy": player.name,
         "first_seed": seed,
-        "made_of": {"simulator": content_of(make_env), "policy": content_of(policy), "cost": content_of(cost)},
+        "early_ends": early_ends,
+        "made_of": {name: content_of(part) for name, part in made_of.items()},
     }
     kept = _kept_before(file, source, episodes)
     if kept is not None and _begun(kept) >= episodes:
@@ -89,7 +93,8 @@ def collect(
     with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
         try:
             for k in range(begun, episodes):
-                keeper.add(_played(simulators, player, space, seed, k))
+                with interrupts.held(k > begun):
+                    keeper.add(_played(simulators, player, space, seed, k))
                 if k == 0 and "hazard" not in (card or {}):
                     _warn_unless_charged(simulator, keeper.fresh)
                 bar.advance(1)
@@ -367,7 +372,15 @@ def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> Ep
     kept = store.card.extra.get("recorded")
     kept = kept if isinstance(kept, dict) else {}
     made_of = kept.get("made_of")
+    if kept.get("early_ends") == "refuse":  # nobody left early so far
+        kept = kept | {"early_ends": source["early_ends"]}
+        store = replace(store, card=store.card.updated(recorded=kept))
     for part, content in source["made_of"].items():
+        if " " in content:
+            raise StoreError(
+                f"'{file}' may hold another recording, since a {part} with a {content.split()[1]} cannot be compared; "
+                "delete it or name another file."
+            )
         if kept.get(part) == source.get(part) and isinstance(made_of, dict) and made_of.get(part) != content:
             raise StoreError(
                 f"'{file}' holds another recording, of a {part} whose code or values differ; delete it or name another "
@@ -382,7 +395,8 @@ def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> Ep
 
 def _said(source: Mapping[str, Any]) -> str:
     """Of whom a recording is, in words."""
-    return f"of {source.get('policy')} in {source.get('simulator')} from seed {source.get('first_seed')}"
+    who = f"of {source.get('policy')} in {source.get('simulator')} from seed {source.get('first_seed')}"
+    return f"{who} with early_ends='{source.get('early_ends')}'"
 
 
 def _has_state(env: Any, seed: int) -> bool:

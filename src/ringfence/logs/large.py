@@ -95,7 +95,7 @@ class _Table:
 
     def when(self, columns: Columns) -> np.ndarray:
         """(M,) times of rows."""
-        return dates(columns[self.time], self.time_format)
+        return dates(self.time, columns[self.time], self.time_format)
 
     def store(self, tables: list[Columns], card: Mapping[str, Any], first: StoreCard | None) -> EpisodeStore:
         """The store of a part, in steps, teams and origins as in the first one."""

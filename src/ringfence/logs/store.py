@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, of_kind, reading, unknown
+from ringfence.errors import StoreError, UserError, of_kind, one_of, reading, unknown
 from ringfence.logs.io.columns import Tables
 from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import TableSchema
@@ -177,7 +177,8 @@ class EpisodeStore:
 
     def digest(self, *names: str) -> str:
         """Of some of the arrays."""
-        arrays = ((name, getattr(self, name)) for name in names)
+        own = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL)}
+        arrays = [(name, one_of("array", name, own)) for name in names]
         return digest_of((name, array) for name, array in arrays if array is not None)
 
     def select(self, keep: np.ndarray) -> EpisodeStore:

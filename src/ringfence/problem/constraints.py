@@ -15,17 +15,22 @@ import functools
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, SupportsFloat
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError, one_of, unknown
+from ringfence.errors import UserError, of_kind, one_of, unknown
 from ringfence.problem.entries import Entries, axes_of
 from ringfence.types import Array
 
 Numbers = np.ndarray | Array
+
+
+def _require_numbers(**given: Any) -> None:
+    for name, value in given.items():
+        of_kind(name, value, SupportsFloat, "give a number")
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,9 @@ class Separation:
 
     radius: float = 0.30  # m; two agents of radius 0.15 touch at 0.30
     safe_margin: float = 0.075  # m; 1.25 radii at 0.30, the ratio MACBF uses (Qin et al. 2021)
+
+    def __post_init__(self):
+        _require_numbers(radius=self.radius, safe_margin=self.safe_margin)
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,7 @@ class SpeedLimit:
     safe_margin: float | None = None  # m/s; None: a fifth of the limit
 
     def __post_init__(self):
+        _require_numbers(limit=self.limit, **{"safe_margin": self.safe_margin} if self.safe_margin is not None else {})
         object.__setattr__(self, "features", tuple(self.features))
 
 

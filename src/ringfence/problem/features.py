@@ -315,7 +315,8 @@ def alone(map: FeatureMap) -> FeatureMap:
 
 
 def _relative(how: dict[int, tuple[int, int]], map: FeatureMap) -> Callable[[Array], Array]:
-    order = others(map.plus.shape[0]) if map.order is None else map.order
+    most = 1 + max((other for _, other in how.values()), default=-1)
+    order = others(map.plus.shape[0], most) if map.order is None else map.order
     return _reconcile_relative(tuple(how.items()), headed(map.names), tuple(tuple(row) for row in order.tolist()))
 
 

@@ -12,9 +12,9 @@ LIKE = 0.05  # of a change: what follows is off by less
 LEAST = 1e-5  # of an entry: less is no change
 
 
-def others(n: int) -> np.ndarray:
-    """(N, N-1) who the others of each agent are: the team but itself, in order."""
-    before = np.arange(n - 1)
+def others(n: int, most: int | None = None) -> np.ndarray:
+    """(N, N-1) who the others of each agent are: the team but itself, in order; no more than `most` of them."""
+    before = np.arange(n - 1)[:most]
     return (before + (before >= np.arange(n)[:, None])).astype(int)
 
 
@@ -23,7 +23,7 @@ def order_in(change: np.ndarray, how: Mapping[int, tuple[int, int]]) -> np.ndarr
     that other's `own.x` less one's own. `how` has the entries: (the own one, which other it is about). None where the
     others may be the team in order, and where their order does not stay."""
     about = [(entry, own, other) for entry, (own, other) in how.items() if other >= 0]
-    usual = others(change.shape[1])[:, : 1 + max((other for *_, other in about), default=-1)]
+    usual = others(change.shape[1], 1 + max((other for *_, other in about), default=-1))
     order = usual.copy()
     for agent, place in np.ndindex(*order.shape):
         told = [(entry, own) for entry, own, other in about if other == place]

@@ -11,7 +11,7 @@ import json
 import operator
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ import numpy as np
 
 from ringfence import algos
 from ringfence.datasets import registry
-from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
+from ringfence.errors import CheckpointError, RunConflict, UserError, of_kind, unknown, whole_number
 from ringfence.logs.provenance import other_data
 from ringfence.logs.resolution import require_resolved
 from ringfence.logs.store import EpisodeStore
@@ -32,10 +32,11 @@ from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
 from ringfence.training.runs import LOGS, Run, write_json
 from ringfence.types import Array, Key, Metrics, PyTree
+from ringfence.utils import interrupts
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import fields_of
 from ringfence.utils.environment import environment
-from ringfence.utils.files import owned, whole
+from ringfence.utils.files import owned, place, whole
 from ringfence.utils.precision import in_float32
 from ringfence.utils.progress import Progress
 from ringfence.world import World
@@ -80,14 +81,15 @@ def train(
         raise unknown("argument of train()", name, inspect.signature(train).parameters)
     _check_store(data)
     seeds = _seeds(seeds)
+    of_kind("changes", changes, Mapping | None, "give a dictionary of settings")
     _check_counts(chunk=chunk, checkpoint_every=checkpoint_every)
     if tensorboard:
         _summary_writer()
     require_resolved(data)
     task = registry.from_store(data)
     job = make_job(algorithm, task, preset, changes or {}, logs := task.logs(data), world)
-    place = folder or (lambda seed: folder_of(out, job, seed))
-    runs = [Run(place(seed)) for seed in seeds]
+    folder = folder or (lambda seed: folder_of(out, job, seed))
+    runs = [Run(folder(seed)) for seed in seeds]
     fresh = [run for run in runs if not run.path.exists()]
     card = worlds.card_of(data)
     with _undone(fresh):
@@ -130,8 +132,8 @@ def _check_store(data: EpisodeStore) -> None:
 
 def _check_counts(**counts: int | None) -> None:
     for name, value in counts.items():
-        if value is not None and value < 1:
-            raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
+        if value is not None:
+            whole_number(name, value, 1)
 
 
 @contextmanager
@@ -336,7 +338,8 @@ class _Training:
             try:
                 while self.step < steps:
                     count = min(self.options.chunk - self.step % self.options.chunk, steps - self.step)
-                    means = self._advance(program, count)
+                    with interrupts.held(self.saved < self.step):
+                        means = self._advance(program, count)
                     bar.advance(count, means)
                     if self.options.on_chunk:
                         self.options.on_chunk(self.step, means)
@@ -421,7 +424,7 @@ def _deleted(state: PyTree) -> bool:
 def folder_of(out: str | Path, job: Job, seed: int) -> Path:
     """runs/simple_spread-medium/icbf/seed-0"""
     name = job.algorithm.name if job.preset == "default" else f"{job.algorithm.name}-{job.preset}"
-    return Path(out) / job.task.name / name / f"seed-{seed}"
+    return place(out) / job.task.name / name / f"seed-{seed}"
 
 
 def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore, card: dict[str, Any]) -> None:

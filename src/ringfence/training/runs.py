@@ -28,7 +28,7 @@ from safetensors import SafetensorError, safe_open
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import PyTree
 from ringfence.utils import schemas
-from ringfence.utils.files import alone, regular, whole
+from ringfence.utils.files import alone, place, regular, whole
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays, save_named
 
 _log = logging.getLogger(__name__)
@@ -43,6 +43,9 @@ class Run:
     """A run folder on disk."""
 
     path: Path
+
+    def __post_init__(self):
+        object.__setattr__(self, "path", place(self.path))
 
     @classmethod
     def of(cls, run: Run | str | Path) -> Run:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from ringfence.errors import UserError, one_of, unknown
+from ringfence.errors import UserError, of_kind, one_of, unknown
 
 Count = Annotated[int, Meta(ge=1, le=10**9)]  # updates
 BatchSize = Annotated[int, Meta(ge=1, le=10**8)]
@@ -57,6 +57,7 @@ def fields_of(config: type) -> dict[str, Field]:
 def build_config(config: type[C], changes: Mapping[str, Any], of: str) -> C:
     """A config dataclass from named changes; strings are read as the field's type. Unknown names, values of another
     type and values out of bounds are refused in the name of who reads them, `of`."""
+    of_kind(f"what {of} are made of", changes, Mapping, "give a dictionary of their fields")
     fields = fields_of(config)
     values = {}
     for name, given in changes.items():

@@ -16,6 +16,7 @@ import numpy as np
 from filelock import FileLock
 
 from ringfence.errors import UserError, reading
+from ringfence.utils import interrupts
 from ringfence.utils.cache import elsewhere
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
@@ -36,6 +37,7 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path)
+        interrupts.unfinished.add(temporary)
         temporary.touch()
         mode = temporary.stat().st_mode & 0o777  # the umask itself can only be read by changing it for all threads
         yield temporary
@@ -48,6 +50,8 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
     except BaseException:
         _remove(temporary)
         raise
+    finally:
+        interrupts.unfinished.discard(temporary)
 
 
 def place(given: str | os.PathLike) -> Path:

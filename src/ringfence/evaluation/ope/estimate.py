@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ringfence.errors import LAST_SEED, UserError, whole_number
+from ringfence.errors import LAST_SEED, UserError, of_kind, whole_number
 from ringfence.evaluation.ope.fqe import FQE, Values, fitted_q
 from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.model_rollout import rollout
@@ -168,6 +168,7 @@ def check_sizes(states: int, transitions: int, updates: int, seed: int) -> None:
 def check(run: Run, store: EpisodeStore) -> None:
     """Refuse logs of another task: of another name, of other agents, entries or widths, or at another time step. All
     tables may be called the same."""
+    of_kind("store", store, EpisodeStore, "give an EpisodeStore")
     config = run.config
     task = config["task"]
     if task != store.card.task:

@@ -29,6 +29,7 @@ KINDS = (".csv", *PARQUET, *LINES, *READERS)
 LONGEST = 1000  # entries of a list
 LINE = 40  # bytes of a row of text, about
 BLOCK = 2**24  # bytes of text that are read at once
+COMMA = re.compile(r"[+-]?(\d+(,\d*)?|,\d+)([eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,26 @@ def read_columns(table: Table, wanted: Iterable[str], form: Form = AS_USUAL) -> 
         columns = {name: frame[name] for name in known(wanted, frame.columns)}
         arrow = frame.implementation.is_pyarrow()
         found = {name: as_numpy(name, x.to_native()) if arrow else x.to_numpy() for name, x in columns.items()}
+    if form.decimal != ".":
+        found = {name: x if name in form.texts else _pointed(x) for name, x in found.items()}
     lengths = {len(column) if column.ndim in (1, 2) else -1 for column in found.values()}
     if len(lengths) != 1 or not lengths - {-1, 0}:
         shapes = ", ".join(f"{name} {column.shape}" for name, column in found.items())
         raise StoreError(f"The columns are not of one length above 0 ({shapes}); give one entry per row.")
     return found
+
+
+def _pointed(column: np.ndarray) -> np.ndarray:
+    """A column with text that is a number with a decimal comma as that number; a CSV file's reader knows it itself."""
+    if column.dtype.kind not in "UO" or column.ndim != 1:
+        return column
+    entries = column.tolist()
+    found = [float(x.replace(",", ".")) if isinstance(x, str) and COMMA.fullmatch(x.strip()) else x for x in entries]
+    if all(type(entry) is float for entry in found):
+        return np.array(found)
+    pointed = np.empty(len(found), object)
+    pointed[:] = found
+    return pointed if found != entries else column
 
 
 def names_of(table: Table, form: Form = AS_USUAL) -> list[str]:
@@ -84,22 +100,36 @@ def seconds(columns: Columns, name: str) -> np.ndarray:
     return (column - column.min() if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
 
 
-def dates(column: np.ndarray, written: str | None = None) -> np.ndarray:
-    """A column of dates that are `written` as text (by default as ISO 8601) as dates; any other as it is. Those with an
-    offset are counted in UTC, and a column in which some have one is left to be refused."""
+def dates(name: str, column: np.ndarray, written: str | None = None) -> np.ndarray:
+    """A column of dates that are `written` as text (by default as ISO 8601) as dates; one of no dates as it is. Those
+    with an offset are counted in UTC, and a column in which some have one is left to be refused."""
     if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
         return column
-    try:
-        if written is None:
-            found = [datetime.fromisoformat(entry) for entry in column.tolist()]
-        else:
-            found = [datetime.strptime(entry, written) for entry in column.tolist()]
-        plain = [one if one.tzinfo is None else one.astimezone(UTC).replace(tzinfo=None) for one in found]
-    except (TypeError, ValueError, OverflowError):  # of the first day of year 1, further east
+    read = [_date(entry, written) for entry in column.tolist()]
+    wrong = [row for row, one in enumerate(read) if one is None]
+    found = [one for one in read if one is not None]
+    if not found and written is None:
         return column
+    if wrong:
+        form = "in ISO 8601" if written is None else f"as time_format='{written}'"
+        remedy = "repair or drop it" if found else "say how it is written"
+        raise StoreError(f"row {wrong[0]}: {name} is {str(column[wrong[0]])[:40]!r}, no time {form}; {remedy}.")
     if len({one.tzinfo is None for one in found}) > 1:
         return column
-    return np.array(plain, "datetime64[us]")
+    return np.array(
+        [one if one.tzinfo is None else one.astimezone(UTC).replace(tzinfo=None) for one in found], "M8[us]"
+    )
+
+
+def _date(entry: Any, written: str | None) -> datetime | None:
+    """The date of an entry, if it is one."""
+    try:
+        found = datetime.fromisoformat(entry) if written is None else datetime.strptime(entry, written)
+        if found.tzinfo is not None:
+            found.astimezone(UTC)
+    except (TypeError, ValueError, OverflowError):  # of the first day of year 1, further east
+        return None
+    return found
 
 
 def _remedy(entry: Any) -> str | None:

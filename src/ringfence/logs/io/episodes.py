@@ -15,7 +15,9 @@ from ringfence.problem.entries import SPACE
 from ringfence.problem.others import others
 
 RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
-BLOCK = 10_000  # rows of episodes that are observed at once
+BLOCK = 2**22  # entries of observations that are made at once
+LARGEST = 2**30  # bytes of observations, above which they are refused unless the table itself is
+TIMES = 8  # the bytes of the table
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +133,9 @@ class Episodes:
         once, and block by block."""
         found = np.empty((*self.rows.shape, len(self.entries)), np.float32)
         with np.errstate(over="ignore"):  # what is too large is refused later, by name
-            for start in range(0, len(found), BLOCK):
-                found[start : start + BLOCK] = self.seen(self.rows[start : start + BLOCK]) - origins
+            block = max(BLOCK // max(found[:1].size, 1), 1)
+            for start in range(0, len(found), block):
+                found[start : start + block] = self.seen(self.rows[start : start + block]) - origins
         return found
 
 
@@ -141,19 +144,59 @@ def team_episodes(motion: Motion) -> Episodes:
     rows, lengths, short = _team_windows(motion)
     entries = motion.own(with_place=True)
     columns = _of_others(motion)
+    _refuse_large(motion, rows.size, len(entries) + (rows.shape[1] - 1) * len(columns))
     for j, whose in enumerate(others(rows.shape[1]).T):
         entries += [Entry(f"other{j}.{name}", column, whose, name in RELATIVE) for name, column in columns.items()]
     cost = motion.tracks.cost[rows]
     if motion.schema.separation is not None:
         cost = _too_close(motion.place[rows], motion.schema.separation.radius)
-    notes = (*short, *_left_out(motion, rows))
-    return Episodes(rows, lengths, entries, cost, notes, agents=_members(motion, rows))
+    members, changes = _members(motion, rows)
+    return Episodes(rows, lengths, entries, cost, (*short, *_left_out(motion, rows), *changes), agents=members)
 
 
-def _members(motion: Motion, rows: np.ndarray) -> list[str] | None:
-    """Who stands in each column of rows (W, N), where that is the same agent throughout."""
+def _refuse_large(motion: Motion, rows: int, entries: int) -> None:
+    """Refuse what everybody sees of everybody else, where that is many times what the table holds."""
+    size = 4 * rows * entries
+    if size > max(LARGEST, TIMES * motion.tracks.state.nbytes):
+        raise StoreError(
+            f"{rows:,} rows of {entries:,} observations would be {size / 2**30:.1f} GiB; let agents see fewer others, "
+            "the nearest alone, with neighbours (--neighbours 6)."
+        )
+
+
+def _members(motion: Motion, rows: np.ndarray) -> tuple[list[str] | None, tuple[str, ...]]:
+    """Who stands in each column of rows (W, N), where that is the same agent throughout; else what is said of it."""
     who = motion.tracks.agent[rows]
-    return None if (who != who[0]).any() else [str(name) for name in motion.agents[who[0]].tolist()]
+    if not (who != who[0]).any():
+        return [str(name) for name in motion.agents[who[0]].tolist()], ()
+    if who.shape[1] == 1:
+        return None, ()
+    places = np.unique(np.stack([who, np.broadcast_to(np.arange(who.shape[1]), who.shape)]).reshape(2, -1), axis=1)
+    moved = motion.agents[np.flatnonzero(np.bincount(places[0]) > 1)].tolist()
+    said = "the team changes its members: who comes is seen where somebody left"
+    if moved:
+        said += f", and so {', '.join(map(str, moved[:5]))}{', ...' * (len(moved) > 5)} change places"
+    return None, (said,)
+
+
+def _in_place(motion: Motion, rows: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Rows (W, N) of windows of `there` rows each, in which agents stay in the column that they had, where nobody who
+    was there in the window before has it now; who is new has the first that is free."""
+    members = motion.tracks.agent[rows[np.cumsum(there) - there]]
+    order = np.empty_like(members)
+    place: dict[int, int] = {}
+    before: set[int] = set()
+    for window, who in enumerate(members.tolist()):
+        taken: dict[int, int] = {}
+        for agent in sorted(who, key=lambda agent: agent not in before):
+            if agent in place:
+                taken.setdefault(place[agent], agent)
+        free = iter(sorted({*range(len(who))} - taken.keys()))
+        taken |= {next(free): agent for agent in who if taken.get(place.get(agent, -1)) != agent}
+        place |= {agent: column for column, agent in taken.items()}
+        order[window] = [who.index(taken[column]) for column in range(len(who))]
+        before = set(who)
+    return np.take_along_axis(rows, np.repeat(order, there, 0), 1)
 
 
 def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -161,6 +204,7 @@ def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ..
     short."""
     schema = motion.schema
     rows, there, n = teams(motion.tracks, schema.team)
+    rows = _in_place(motion, rows, there)
     index, lengths = cut(there, schema.min_episode_steps, schema.max_episode_steps)
     if not len(lengths):
         here = np.unique(motion.tracks.agent).size
@@ -249,13 +293,15 @@ def neighbour_episodes(motion: Motion) -> Episodes:
             f"No agent is there for {schema.min_episode_steps} steps of {tracks.dt:g} s; give a smaller "
             "min_episode_steps."
         )
+    own, axes = motion.own(with_place=False), (*schema.position, *schema.axes)
+    _refuse_large(motion, len(index), len(own) + schema.neighbours * (1 + len(axes)))
     near = nearest(tracks, motion.place, schema.neighbours, schema.sensing_radius or np.inf)
     seen = near >= 0
     offset = np.where(seen[..., None], motion.place[near] - motion.place[:, None], 0.0)
     drift = np.where(seen[..., None], motion.velocity[near] - motion.velocity[:, None], 0.0)
     radius = schema.sensing_radius or float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
     offset[~seen] = np.eye(offset.shape[-1])[0] * radius  # nobody is as far as one sees
-    entries = motion.own(with_place=False)
+    entries = [*own]
     for j in range(schema.neighbours):
         entries += [Entry(f"other{j}.d{axis}", offset[:, j, k]) for k, axis in enumerate(schema.position)]
         entries += [Entry(f"other{j}.dv{axis}", drift[:, j, k]) for k, axis in enumerate(schema.axes)]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, of_kind
 from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.io.units import angle_of
 from ringfence.logs.schema import GivenCard, StoreCard
@@ -30,8 +30,13 @@ def observe(
     here are refused. Agents who are homogeneous come in any number and order. Numbers are as they were measured: where
     the card tells origins, they are in double precision, and whoever acts on them takes the origins from them.
     """
+    of_kind("card", card, StoreCard | Mapping, "give a store's card")
+    of_kind("state", state, Mapping, "give a dictionary of columns, with one number of each agent")
+    of_kind("goal", goal, Mapping | None, "give a dictionary of columns, with one number of each agent")
     fields = card.to_dict() if isinstance(card, StoreCard) else card
     names: list[str] = list(fields.get("observation_names") or ())
+    if not names:
+        raise UserError("card names no observations; give that of a store which from_table made.")
     columns = {name: _numbers(f"state['{name}']", column) for name, column in state.items()}
     goals = {name: _numbers(f"goal['{name}']", column) for name, column in (goal or {}).items()}
     for name in [name for name in columns if f"own.cos_{name}" in names]:

@@ -17,6 +17,7 @@ COARSE = 0.01  # of what a column changes by in a row: the distance of neighbour
 LONG = 5.0  # s, a step that hardly any controller has
 FEW_MOVED = 0.01  # of the rows, that may have jumped and leave the others in doubt of nothing
 MANY_MOVED = 0.05  # of the rows, that are not dropped for having jumped: the unit is another
+JITTER = 0.25  # of a step, by which rows of one moment come apart
 SPAN = 10  # rows that velocities are compared over
 JITTERS = 0.25  # power of rows, by which places move farther than they jitter: 0 of jitter alone, 0.5 of a random walk
 DEGREE = 111_000.0  # m of a degree of latitude
@@ -71,7 +72,7 @@ class Values:
 def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     """The rows in order; an agent's times must increase."""
     dates = columns[schema.time].dtype.kind in "mM"
-    clock = seconds(columns, schema.time) * (1.0 if dates else schema.time_unit)
+    clock = seconds(columns, schema.time) * (1.0 if dates else schema.time_unit or 1.0)
     agents, owner = numbered(words(columns, schema.agent))
     recording = np.zeros(len(clock), int)
     if schema.episode is not None:
@@ -87,7 +88,22 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
         raise StoreError(
             f"No agent has two rows; check that {schema.agent} tells agents and {schema.time} their times."
         )
-    return rows
+    return rows if schema.homogeneous else _ended_together(rows)
+
+
+def _ended_together(rows: Rows) -> Rows:
+    """The rows with all of a team ended where one of it has: an episode is of all of them."""
+    ended, flagged = rows.ended.copy(), np.flatnonzero(rows.ended)
+    owner = rows.recording[flagged]
+    track = np.flatnonzero(np.append(True, (np.diff(rows.recording) != 0) | (np.diff(rows.agent) != 0)))
+    for first, end in zip(track, [*track[1:], len(ended)]) if len(flagged) else ():
+        begin, stop = (np.searchsorted(owner, rows.recording[first], side) for side in ("left", "right"))
+        moments = rows.time[flagged[begin:stop]]
+        here = rows.time[first:end]
+        last = np.searchsorted(here, moments + JITTER * rows.step, "right") - 1
+        there = (last >= 0) & (last < len(here) - 1) & (here[last] > moments - (1 + JITTER) * rows.step)
+        ended[first + last[there]] = True
+    return replace(rows, ended=ended)
 
 
 def _repeats(rows: Rows, columns: Columns, schema: TableSchema) -> np.ndarray:

@@ -7,6 +7,7 @@ follows from what (docs/import.md).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from ringfence.logs.io.columns import (
     stacked,
     words,
 )
-from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
+from ringfence.logs.io.episodes import BLOCK, Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.rows import (
     Rows,
@@ -43,7 +44,7 @@ from ringfence.logs.io.rows import (
     without_jumps,
 )
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample
+from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample, unrounded
 from ringfence.logs.io.units import in_metres, without_angles
 from ringfence.logs.io.wide import read_wide
 from ringfence.logs.moving import looked_at, origins_of
@@ -118,7 +119,7 @@ def read_parts(
     they tell."""
     of_kind("card", card, Mapping | None, "give a dictionary of its fields")
     of_kind("notes", notes, Sequence, "give a list of sentences")
-    columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])
+    columns, schema = _joined([_columns_of(one, schema, whose) for whose, one in _each(table, schema.join)])
     columns, metres = in_metres(columns, schema)
     columns, schema, angles = without_angles(columns, schema)
     rows = sorted_rows(columns, schema)
@@ -127,6 +128,7 @@ def read_parts(
     values = values_of(columns, rows, schema)
     rows, values, dropped = without_jumps(rows, values, schema)
     refuse_jumps(rows, values, schema)
+    rows, rounded = unrounded(rows)
     clock = clock_of(rows, schema)
     doubtful = list(doubts(rows, values, clock.dt, schema))
     lost = any(blurred(rows, values))
@@ -139,7 +141,18 @@ def read_parts(
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
-    warnings = [*notes, *metres, *angles, *repeated, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
+    warnings = [
+        *notes,
+        *metres,
+        *angles,
+        *repeated,
+        *dropped,
+        *rounded,
+        *doubtful,
+        *drifts,
+        *_made_of(schema),
+        *episodes.notes,
+    ]
     return _arrays(motion, episodes, warnings, card or {}, lost, origins), int(early.sum())
 
 
@@ -147,13 +160,14 @@ def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple
     """A table in a published format (`LAYOUTS`), or several, as one that `read_table` takes, and its schema; options
     are those of a `TableSchema` beside columns."""
     known = one_of("layout", layout, LAYOUTS)
-    tables = [_of_layout(one, known, layout, options, k) for k, one in enumerate(_each(table))]
+    join = bool(options.get("join"))
+    tables = [_of_layout(one, known, layout, options, whose) for whose, one in _each(table, join)]
     columns, schema = _joined(tables)
     return columns, replace(schema, join=False)
 
 
 def _of_layout(
-    table: Table, known: Layout, layout: str, options: Mapping[str, Any], number: int
+    table: Table, known: Layout, layout: str, options: Mapping[str, Any], whose: str
 ) -> tuple[Columns, TableSchema]:
     names = {"time": "time", "agent": "agent", "state": known.state, "action": known.action}
     for name in names:
@@ -170,17 +184,27 @@ def _of_layout(
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
     if schema.join:
-        columns["agent"] = _after_the_table(table, columns, schema, number)
+        columns["agent"] = _after_the_table(whose, columns, schema)
     return columns, schema
 
 
-def _each(table: Tables) -> Sequence[Table]:
-    """Tables, of one or several."""
-    if not isinstance(table, list | tuple):
-        return [table]
-    if not table:
+def _each(table: Tables, join: bool) -> list[tuple[str, Table]]:
+    """Tables, of one or several, and what agents are called after where they `join`: as much of the end of paths as
+    tells them apart, and the number of what is no file."""
+    tables = list(table) if isinstance(table, list | tuple) else [table]
+    if not tables:
         raise UserError("The list of tables is empty; give one table, or several.")
-    return table
+    files = [Path(os.path.abspath(one) if isinstance(one, str | Path) else str(k)) for k, one in enumerate(tables)]
+    names = [""] * len(files)
+    for paths in ([file.with_suffix("") for file in files], files) if join else ():
+        for many in range(1, max(len(path.parts) for path in paths) + 1):
+            names = [str(Path(*path.parts[-many:])) for path in paths]
+            if len({*names}) == len(names):
+                return list(zip(names, tables))
+    if join:
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UserError(f"'{twice}' is given twice, and its agents would be one; give each table once.")
+    return list(zip(names, tables))
 
 
 def _joined(tables: list[tuple[Columns, TableSchema]]) -> tuple[Columns, TableSchema]:
@@ -209,8 +233,8 @@ def _one_after_another(name: str, parts: list[np.ndarray]) -> np.ndarray:
         raise StoreError(f"{name} is {kinds} in tables that are given together; write it in one way.") from None
 
 
-def _columns_of(table: Table, schema: TableSchema, number: int) -> tuple[Columns, TableSchema]:
-    """The schema's columns of table `number` under our names, and the schema with the entries of its lists."""
+def _columns_of(table: Table, schema: TableSchema, whose: str) -> tuple[Columns, TableSchema]:
+    """The schema's columns of a table under our names, and the schema with the entries of its lists."""
     theirs = {ours: their for their, ours in schema.rename.items()}
     texts = [name for name in (schema.agent, schema.episode, schema.time_format and schema.time) if name]
     form = Form(schema.header, schema.decimal, tuple(theirs.get(name, name) for name in texts))
@@ -223,8 +247,8 @@ def _columns_of(table: Table, schema: TableSchema, number: int) -> tuple[Columns
         read = read_columns(table, [theirs.get(name, name) for name in named], form)
         columns = {name: read[theirs.get(name, name)] for name in named}
     if schema.join:
-        columns[schema.agent] = _after_the_table(table, columns, schema, number)
-    columns[schema.time] = dates(columns[schema.time], schema.time_format)
+        columns[schema.agent] = _after_the_table(whose, columns, schema)
+    columns[schema.time] = dates(schema.time, columns[schema.time], schema.time_format)
     names = entry_names(table)
     return _expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
 
@@ -251,9 +275,8 @@ def _expanded(
     return found, replace(schema, **fields)
 
 
-def _after_the_table(table: Table, columns: Columns, schema: TableSchema, number: int) -> np.ndarray:
+def _after_the_table(whose: str, columns: Columns, schema: TableSchema) -> np.ndarray:
     """(M,) names of the agents of a table that is joined with others."""
-    whose = Path(table).stem if isinstance(table, str | Path) else str(number)
     if schema.agent not in columns:
         return np.full(len(columns[schema.time]), whose)
     return np.array([f"{whose}/{name}" for name in words(columns, schema.agent)])
@@ -305,6 +328,7 @@ def _arrays(
         if costs.shape[1] > 1 and costs.any():
             warnings = [*warnings, "all agents have the same costs: they are taken for the team's"]
         costs = costs[:, 0]
+    warnings = [*warnings, *_costly_starts(motion, episodes)]
     actions = _actions(motion, episodes)[episodes.leaves]
     low, high = _of_commands(actions) if schema.action else _usual(actions)
     warnings = [*warnings, *_one_sided(schema.action, low, high, card)]
@@ -333,6 +357,7 @@ def _arrays(
     named = len(schema.cost) > 1
     ends = np.cumsum(episodes.lengths - 1)
     rows = looked_at(ends)
+    rows = rows[:: 1 + len(rows) * len(episodes.entries) * episodes.rows.shape[1] // BLOCK]
     if origins is not None:
         origins = origins if origins.any() else None
     elif not lost and not card.get("observation_origins"):
@@ -348,6 +373,18 @@ def _arrays(
         "terminated": motion.tracks.ended[episodes.rows[episodes.last]].any(1),
         "card": {**facts, **card},
     }
+
+
+def _costly_starts(motion: Motion, episodes: Episodes) -> Iterator[str]:
+    """What costs something on the row that an episode begins with, and is not that which one before ends with."""
+    starts = np.flatnonzero(~episodes.arrives)
+    own = ~np.isin(episodes.rows[starts, 0], episodes.rows[episodes.last, 0])
+    lost = int(episodes.cost[starts[own]].any((1, 2)).sum())
+    if motion.schema.cost and lost:
+        yield (
+            f"{lost} episodes begin with a row that costs something, which no step leads to: that cost is left out (a "
+            "longer gap lets an episode go on over a hole)"
+        )
 
 
 def _of_commands(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ class Columns:
 
     time: str = "time"
     """column of times, s (or of dates)."""
-    time_unit: float = 1.0
+    time_unit: float | None = None
     """seconds of one, where times are something else, e.g. 0.001 of ms, 0.04 of frames at 25 a second."""
     agent: str = "agent"
     """column that tells agents apart."""
@@ -63,7 +63,7 @@ class Written:
     header: tuple[str, ...] = ()
     """names of the columns of a text file without a head; its lines that begin with # are left out."""
     decimal: Literal[".", ","] = "."
-    """what a CSV file writes for a decimal point."""
+    """what text writes for a decimal point."""
     time_format: str | None = None
     """how times are written as text, e.g. "%d/%m/%Y %H:%M:%S"; ISO 8601 needs none."""
     project: Literal["utm", "none"] | None = None

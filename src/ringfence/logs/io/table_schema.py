@@ -19,6 +19,27 @@ LISTS = ("state", "action", "goal", "cost", "header")
 PROJECTIONS = ("utm", "none")
 LONGITUDE = {"lon", "lng", "long", "longitude"}  # words in names of columns
 LATITUDE = {"lat", "latitude"}
+DEGREES = {"deg", "degs", "degree", "degrees"}
+TIMES = {  # s of what names of columns tell; None: nobody knows
+    1e-3: "ms msec msecs millis millisecond milliseconds",
+    1e-6: "us µs usec usecs micros microsecond microseconds",
+    1e-9: "ns nsec nsecs nanos nanosecond nanoseconds",
+    60.0: "min mins minute minutes",
+    3600.0: "h hrs hour hours",
+    None: "frame frames tick ticks step steps",
+}
+LENGTHS = {  # m
+    1e-3: "mm millimeter millimeters millimetre millimetres",
+    0.01: "cm centimeter centimeters centimetre centimetres",
+    0.1: "dm",
+    1e3: "km kilometer kilometers kilometre kilometres",
+    0.3048: "ft foot feet",
+    0.0254: "inch inches",
+    0.9144: "yd yard yards",
+    1609.344: "mi mile miles",
+    None: "px pix pixel pixels",
+}
+SPEEDS = LENGTHS | {1 / 3.6: "kmh kph", 0.44704: "mph", 1852 / 3600: "kn kt kts knot knots"}  # m/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +47,7 @@ class TableSchema(Columns, EpisodeRules, Written):
     """Columns of a table with a row per agent and time, in SI units. Checked when made; lists may be given as any
     iterable of names, and `cost` as one name.
 
-    `time` is in units of `time_unit` s, e.g. 0.04 of frames at 25 a second; dates are what they are.
+    `time` is in units of `time_unit` s (1 by default), e.g. 0.04 of frames at 25 a second; dates are what they are.
 
     Columns of `state` named x, y, z are where an agent is, and vx, vy, vz how fast it moves in the same axes.
     Velocities that are not there are the differences of positions. `action` is an agent's command at that time, which
@@ -221,14 +242,52 @@ def _project(schema: TableSchema) -> None:
     theirs = {ours: their for their, ours in schema.rename.items()}
     for ours in (*schema.position, *schema.goal):
         name = theirs.get(ours, ours)
-        words = set(re.split(r"[^a-z]+", name.lower()))
-        if schema.project is None and words & (LONGITUDE | LATITUDE):
+        words = set(_words_of(name))
+        if schema.project is None and words & (LONGITUDE | LATITUDE | DEGREES):
             raise UserError(
                 f"'{name}' is in degrees by its name, and places are in metres; give project='utm' (--project utm) to "
                 "make metres of longitude=x and latitude=y, or 'none' if it is in metres."
             )
         if schema.project == "utm" and words & {"x": LATITUDE, "y": LONGITUDE}.get(ours, set()):
             raise UserError(f"'{name}' is called {ours} for project='utm'; rename longitude=x latitude=y.")
+
+
+def _units(schema: TableSchema) -> None:
+    """Units that names tell, where nobody says a factor."""
+    theirs = {ours: their for their, ours in schema.rename.items()}
+    time = theirs.get(schema.time, schema.time)
+    found = _unit_of(_words_of(time), TIMES)
+    if found and schema.time_unit is None:
+        raise UserError(
+            f"'{time}' counts {found[0]} by its name, and times are in seconds; give as time_unit (--time-unit) "
+            f"{found[1] or 'the seconds of one'}, or 1 if it is in seconds."
+        )
+    for ours in (*schema.position, *schema.velocity, *schema.goal):
+        name = theirs.get(ours, ours)
+        *before, last = _words_of(name)
+        found = _unit_of(["".join([*before[-1:], last]), last, *before], SPEEDS if ours in schema.velocity else LENGTHS)
+        is_place = found and found[0] == "px" and "x" not in before and ours[-1:] == "x"  # as py is
+        if found and before and not is_place and ours not in schema.scale:
+            raise UserError(
+                f"'{name}' is in {found[0]} by its name, and {ours} is in SI units; give as scale of {ours} (--scale "
+                f"{ours}=...) {found[1] or 'the metres of one'}, or 1 if it is in SI units."
+            )
+    for ours in set(schema.state) - {*schema.position, *schema.velocity, *schema.scale}:
+        if DEGREES & {*_words_of(name := theirs.get(ours, ours))} - {*_words_of(ours)}:
+            raise UserError(f"'{name}' is in degrees by its name; call it {ours}_deg, or give a scale of {ours}.")
+
+
+def _words_of(name: str) -> list[str]:
+    """Words of a column's name: t, ms of tMs, t_ms and t [ms]."""
+    return re.findall(r"[a-zµ]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()) or [""]
+
+
+def _unit_of(words: list[str], units: Mapping[float | None, str]) -> tuple[str, str] | None:
+    """The first word that is a unit, and its factor, of which there is none where nobody knows it."""
+    known = {
+        word: "" if factor is None else f"{factor:.6g}" for factor, named in units.items() for word in named.split()
+    }
+    return next(((word, known[word]) for word in words if word in known), None)
 
 
 RULES: tuple[Callable[[TableSchema], None], ...] = (
@@ -238,4 +297,5 @@ RULES: tuple[Callable[[TableSchema], None], ...] = (
     _danger_and_action,
     _written,
     _project,
+    _units,
 )

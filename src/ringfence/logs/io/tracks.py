@@ -5,6 +5,7 @@ Tracks are NumPy on flat arrays; `rows.py` says what a table's rows are, `episod
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,8 @@ NEAR = 10  # rows before and after, whose phase is one
 COHERENT = 0.3  # length of the mean phase of rows that share a clock, nearly everywhere; 0 of rows at random times
 SLIPS = 0.25  # of a step, above which rows are put on whole steps
 OFF = 0.01  # of a step, above which it is said
+FEW = 5  # rows whose times were rounded another way than most, below which none was: rows were lost
+COARSEST = 0.8  # of a step, to which times may be rounded; coarser ones are those of a clock that lost rows
 FINEST = 1000  # steps between two rows: more are another unit of time
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 STEADY = 0.5  # length of the mean phase of rows that keep their place between steps
@@ -68,6 +71,60 @@ def _step(rows: Rows) -> float:
     spans = np.maximum.reduceat(rows.time, begins) - np.minimum.reduceat(rows.time, begins)  # of each recording
     longest = float(spans.max())
     return next((step for step in nice if abs(step / mean - 1) * longest <= EXACT * step), mean)
+
+
+# --- rounding ---
+def unrounded(rows: Rows) -> tuple[Rows, list[str]]:
+    """The rows at the times that theirs were rounded from, where all are within one rounding of a clock that ticks
+    evenly, of each recording or else of each agent; and a sentence that says so."""
+    unit = _unit(rows.time)
+    apart = np.diff(rows.time)[rows.follows]
+    usual = apart[np.abs(apart - rows.step) < 1.5 * unit]
+    mean = better = float(usual.mean()) if len(usual) else rows.step  # the mean of all where no row is lost
+    if (np.abs(usual - rows.step) > unit / 2).sum() < FEW or not DIGITS * mean < unit <= COARSEST * mean:
+        return rows, []
+    track = np.cumsum(np.append(True, ~rows.follows))
+    for lag in 10 ** np.arange(1, np.log10(np.bincount(track).max())).astype(int):
+        passed = (rows.time[lag:] - rows.time[:-lag])[track[lag:] == track[:-lag]]
+        better = float(passed.sum() / max(np.round(passed / better).sum(), 1))
+    hertz = 1 / max(round(1 / better), 1)
+    for step, whose in itertools.product((hertz, better, mean), (rows.recording, track)):
+        order = np.argsort(whose, kind="stable")
+        parts = [
+            _ticks(rows.time[here], step, unit) for here in np.split(order, np.flatnonzero(np.diff(whose[order])) + 1)
+        ]
+        found = [part for part in parts if part is not None]
+        if len(found) < len(parts):
+            continue
+        time = np.empty(len(order))
+        time[order] = np.concatenate(found)
+        if (np.diff(time)[rows.follows] > 0).all():
+            said = f"times are rounded to {unit:.3g} s: rows are at those of the clock of {step:.6g} s that fits them"
+            return replace(rows, time=time), [said]
+    return rows, []
+
+
+def _ticks(time: np.ndarray, step: float, unit: float) -> np.ndarray | None:
+    """Times (M,) of a clock that ticks every `step` s, or nearly so, which within one `unit` (s) are those given."""
+    passed = time - time[0]
+    tick = np.round(passed / step - np.angle(np.exp(2j * np.pi / step * passed).mean()) / (2 * np.pi))
+    off = time - tick * step
+    if np.ptp(off) > unit * (1 + CLOSE) and np.ptp(tick) > 0:  # its own clock is another
+        step = float(np.polyfit(tick, passed, 1)[0])
+        off = time - tick * step
+    return None if np.ptp(off) > unit * (1 + CLOSE) else off.mean() + tick * step
+
+
+def _unit(time: np.ndarray) -> float:
+    """s of which all times are whole numbers since the first; 0 where there is none that their digits tell apart."""
+    passed = time - time.min()
+    blur = 4 * float(np.spacing(np.abs(time).max()))
+    for size in 10.0 ** np.arange(14):
+        if blur * size > 0.1 or passed.max() * size > 2**62:
+            break
+        if np.abs(passed * size - np.round(passed * size)).max() <= max(blur * size, 1e-6):
+            return float(np.gcd.reduce(np.round(passed * size).astype(np.int64)) / size)
+    return 0.0
 
 
 # --- drift ---
