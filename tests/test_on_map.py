@@ -154,50 +154,6 @@ def test_of_the_team_where_lists_tell_of_the_nearest_alone(dotted):
     assert "other2.dx" not in team.map(of_people, [*OWN, *of_others(2)], team=True).names
 
 
-@pytest.mark.parametrize("dotted", [True, False])
-def test_of_the_team_where_lists_tell_of_the_nearest_alone(dotted):
-    """Who is in which place of a list changes, and where all are is known: who comes from farther away is seen, too."""
-    team = Team(4)
-    gap = team.others() - team.own[..., None, :]
-    nearest = (gap[..., :2] ** 2).sum(-1).argsort(-1)[..., :2, None]
-    x = np.concatenate([team.own, flat(np.take_along_axis(gap, nearest, 3))], -1)
-    names = [*OWN, *of_others(2)] if dotted else ["x", "y", "vx", "vy", *(f"near{k}_{d}" for k in range(2) for d in ("dx", "dy", "dvx", "dvy"))]
-    map = team.map(x, names, team=True)
-    assert set(map.names) == {*OWN, *of_others(3)} and len(map.follows) == 12
-    at = [map.names.index(name) for name in of_others(3)]
-    assert np.allclose(map(x, None)[..., at], flat(gap), atol=1e-5)
-    blind = np.delete(x, (0, 1), -1)  # nobody logs where he is
-    assert "other2.dvx" not in team.map(blind, np.delete(names, (0, 1)).tolist(), team=True).names
-    whole = np.concatenate([team.own, flat(gap)], -1)
-    assert team.map(whole, [*OWN, *of_others(3)], team=True).names == (*OWN, *of_others(3)), "all are seen already"
-    walkers = np.random.default_rng(0).normal(size=gap[..., :2, :].shape)  # nobody of the team
-    of_people = np.concatenate([team.own, flat(walkers)], -1)
-    assert team.map(of_people, [*OWN, *of_others(2)], team=True).width == 12
-    assert "other2.dx" not in team.map(of_people, [*OWN, *of_others(2)], team=True).names
-
-
-@pytest.mark.parametrize("dotted", [True, False])
-def test_of_the_team_where_lists_tell_of_the_nearest_alone(dotted):
-    """Who is in which place of a list changes, and where all are is known: who comes from farther away is seen, too."""
-    team = Team(4)
-    gap = team.others() - team.own[..., None, :]
-    nearest = (gap[..., :2] ** 2).sum(-1).argsort(-1)[..., :2, None]
-    x = np.concatenate([team.own, flat(np.take_along_axis(gap, nearest, 3))], -1)
-    names = [*OWN, *of_others(2)] if dotted else ["x", "y", "vx", "vy", *(f"near{k}_{d}" for k in range(2) for d in ("dx", "dy", "dvx", "dvy"))]
-    map = team.map(x, names, team=True)
-    assert set(map.names) == {*OWN, *of_others(3)} and len(map.follows) == 12
-    at = [map.names.index(name) for name in of_others(3)]
-    assert np.allclose(map(x, None)[..., at], flat(gap), atol=1e-5)
-    blind = np.delete(x, (0, 1), -1)  # nobody logs where he is
-    assert "other2.dvx" not in team.map(blind, np.delete(names, (0, 1)).tolist(), team=True).names
-    whole = np.concatenate([team.own, flat(gap)], -1)
-    assert team.map(whole, [*OWN, *of_others(3)], team=True).names == (*OWN, *of_others(3)), "all are seen already"
-    walkers = np.random.default_rng(0).normal(size=gap[..., :2, :].shape)  # nobody of the team
-    of_people = np.concatenate([team.own, flat(walkers)], -1)
-    assert team.map(of_people, [*OWN, *of_others(2)], team=True).width == 12
-    assert "other2.dx" not in team.map(of_people, [*OWN, *of_others(2)], team=True).names
-
-
 @pytest.mark.parametrize("agents", [1, 3])
 def test_things_that_stand_and_that_walk(agents):
     team = Team(agents)
