@@ -290,7 +290,7 @@ def _way(steps: Steps, read: Quantity) -> tuple[np.ndarray, np.ndarray, np.ndarr
     low = 0.0 if from_zero(read) else low
     if is_condition(read):  # what is in danger is rare
         low = min(low, float(read.of(steps.x).min()))
-    high = max(high, low + 1e-9)
+    high = max(high, low + max(1e-9, 1e-6 * abs(low)))  # as single precision tells apart
     ranks = np.linspace(0.0, 1.0, int(np.clip(len(bad) / VISITS, 1, RANKS)) + 1)
     values = np.unique([low, *np.clip(np.quantile(bad, ranks) if len(bad) else [], low, high), high])
     spread = (values - low) / (high - low)
