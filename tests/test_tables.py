@@ -844,3 +844,46 @@ def test_of_a_large_store_some_episodes_are_read(tmp_path):
     known = set(store.digests_of_episodes)
     assert set(some.digests_of_episodes) <= known
     assert EpisodeStore.load(tmp_path / "fleet.h5", memory=10 * size).content == store.content
+
+
+@pytest.mark.parametrize("hertz, each", [(20, 3), (10, 4)])
+def test_a_clock_that_loses_every_so_many_th_row_is_not_rounded(hertz, each):
+    kept = np.delete(np.arange(400), np.arange(each - 1, 400, each))
+    table = dict(t=kept / hertz, id=0 * kept, x=kept / hertz, y=0.0 * kept)
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"])
+    assert not any("rounded" in note for note in store.card.warnings)
+    vx = store.card.observation_names.index("own.vx")
+    np.testing.assert_allclose(entry(store, "own.vx") + store.card.observation_origins[vx], 1.0, atol=1e-3)
+
+
+def test_tables_in_parts_refuse_what_parts_would_make_different(tmp_path):
+    table = fleet(episodes=20)
+    names = {k: v for k, v in NAMES.items()}
+    refused = []
+    for k, (change, options) in enumerate(
+        (
+            ({}, {"neighbours": 1}),
+            ({"id": np.where(table["run"] > 10, np.char.add(table["id"], "b"), table["id"])}, {}),
+            ({"x": table["x"] + 5e6 * (table["run"] < 10), "y": table["y"]}, {}),
+        )
+    ):
+        file = written(table | change, tmp_path / f"{k}.parquet")
+        with pytest.raises(UserError) as error:
+            large.import_large([file], tmp_path / "o.h5", rows=150, quiet=True, **names, **options)
+        refused.append(str(error.value))
+    assert "need sensing_radius" in refused[0] and "other agents than the rows before" in refused[1]
+    assert "far from the rows before" in refused[2]
+    file = tmp_path / "twice.csv"
+    file.write_text("t,id,x,x\n" + "0,0,0,1\n" * 9)
+    with pytest.raises(StoreError, match="has the column 'x' twice"):
+        large.import_large([file], tmp_path / "o.h5", quiet=True, time="t", agent="id", state=["x"])
+
+
+def test_points_and_flags_that_come_later_in_a_csv_are_read(tmp_path):
+    file = tmp_path / "late.csv"
+    rows = [f"{k if k < 2e5 else k + 0.0},0,{k % 7},{'true' if k % 50 == 49 else 'false'}" for k in range(400_000)]
+    file.write_text("t,id,x,over\n" + "\n".join(rows))
+    made = large.import_large(
+        [file], tmp_path / "o.h5", rows=100_000, quiet=True, time="t", agent="id", state=["x"], terminated="over"
+    )
+    assert made.steps > 390_000 and EpisodeStore.load(tmp_path / "o.h5").terminated.sum() > 7000

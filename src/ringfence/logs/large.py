@@ -2,7 +2,8 @@
 
 Such a table is in the order of its times, whoever's rows they are, or of recordings and their times. Where a part ends
 within a recording, so does an episode, by the recording and not by itself; no step is lost, since the next part begins
-with the rows that the one before ended with. Steps, teams and what entries are moved by are those of the first part.
+with the rows that the one before ended with, if agents are logged at the same times. Steps, teams and what entries are
+moved by are those of the first part.
 """
 
 from __future__ import annotations
@@ -10,19 +11,23 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ringfence.errors import StoreError, one_of
-from ringfence.logs.io.columns import Columns, Form, batches, dates, rows_of, words
+from ringfence.errors import StoreError, UserError, one_of
+from ringfence.logs.io.columns import Columns, Form, batches, dates, numbers, rows_of, words
 from ringfence.logs.io.table import LAYOUTS, read_layout, read_table
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import GAP
+from ringfence.logs.resolution import coarse
 from ringfence.logs.schema import ARRAYS, OPTIONAL, StoreCard
 from ringfence.logs.store import EpisodeStore, Pieces, write
+from ringfence.utils import interrupts
+from ringfence.utils.cache import elsewhere
 from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
 
@@ -51,8 +56,8 @@ def import_large(
     path = writable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     table = _Table.of(layout, options)
-    with tempfile.TemporaryDirectory(dir=path.absolute().parent, prefix=f".{path.name}.") as beside:
-        kept = _Growing(Path(beside))
+    with _beside(path) as folder:
+        kept = _Growing(folder)
         with Progress("rows", max(1, sum(rows_of(Path(file)) for file in files)), quiet=quiet) as progress:
             for part in _parts(files, table, rows):
                 try:
@@ -61,6 +66,22 @@ def import_large(
                     raise StoreError(f"{part.name}: {error}") from None
                 progress.advance(part.rows)
         return kept.finish(path)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A folder beside a file that is to be written; what the disk refuses there is said of the file."""
+    with tempfile.TemporaryDirectory(dir=path.absolute().parent, prefix=f".{path.name}.") as name:
+        folder = Path(name)
+        interrupts.unfinished.add(folder)
+        try:
+            yield folder
+        except OSError as error:
+            raise UserError(
+                f"'{path}' could not be written ({error}); free some space or {elsewhere(path)}."
+            ) from error
+        finally:
+            interrupts.unfinished.discard(folder)
 
 
 @dataclass(frozen=True)
@@ -74,7 +95,8 @@ class _Table:
     wanted: list[str] | None  # all where it is not known
     form: Form
     time_format: str | None
-    numbers: tuple[str, ...] = ()
+    numbers: tuple[str, ...] = ()  # columns that are nothing else
+    costs: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, layout: str | None, options: Mapping[str, Any]) -> _Table:
@@ -86,16 +108,24 @@ class _Table:
         theirs = {ours: their for their, ours in schema.rename.items()}
         named = [theirs.get(name, name) for name in schema.columns]
         time, agent = (theirs.get(name, name) for name in (schema.time, schema.agent))
-        episode = schema.episode and theirs.get(schema.episode, schema.episode)
+        episode, ended = (name and theirs.get(name, name) for name in (schema.episode, schema.terminated))
+        if schema.homogeneous and schema.sensing_radius is None:
+            raise UserError("Tables that are read in parts need sensing_radius (--sensing-radius) beside neighbours.")
+        costs = tuple(theirs.get(name, name) for name in schema.cost)
         form = Form(schema.header, schema.decimal, tuple(name for name in (agent, episode) if name))
         if schema.wide:
-            return cls(None, options, time, episode, None, form, schema.time_format)
-        others = tuple(name for name in named if name not in (time, agent, episode))
-        return cls(None, options, time, episode, named, form, schema.time_format, others)
+            return cls(None, options, time, episode, None, form, schema.time_format, costs=costs)
+        others = tuple(name for name in named if name not in (time, agent, episode, ended))
+        return cls(None, options, time, episode, named, form, schema.time_format, others, costs)
 
     def when(self, columns: Columns) -> np.ndarray:
         """(M,) times of rows."""
-        return dates(self.time, columns[self.time], self.time_format)
+        found = dates(self.time, columns[self.time], self.time_format)
+        return found if found.dtype.kind in "biufmM" else numbers({self.time: found}, self.time)
+
+    def whose(self, columns: Columns) -> np.ndarray:
+        """(M,) recordings of rows."""
+        return np.zeros(len(columns[self.time]), int) if self.episode is None else words(columns, self.episode)
 
     def store(self, tables: list[Columns], card: Mapping[str, Any], first: StoreCard | None) -> EpisodeStore:
         """The store of a part, in steps, teams and origins as in the first one."""
@@ -152,8 +182,8 @@ def _of_file(file: Path, table: _Table, rows: int) -> Iterator[_Part]:
         new = len(batch[table.time])
         part = {k: np.concatenate([held[k], column]) if held else column for k, column in batch.items()}
         when = table.when(part)
-        whose = np.zeros(len(when), int) if table.episode is None else words(part, table.episode)
-        name = f"rows {done:,} to {done + new - 1:,} of '{file}'"
+        whose = table.whose(part)
+        name = f"rows {done + new - len(when):,} to {done + new - 1:,} of '{file}'"
         goes_on = when[-new:][whose[-new:] == whose[0]]
         if (reached is not None and (goes_on < reached).any()) or over & set(whose.tolist()):
             raise StoreError(
@@ -167,7 +197,7 @@ def _of_file(file: Path, table: _Table, rows: int) -> Iterator[_Part]:
             later = whose == whose[-1]
             kept = ~later
             over |= set(whose[kept].tolist())
-        elif following:
+        elif following and table.whose(following)[0] == whose[0]:
             times = np.unique(when)
             reached = times[-1]
             if table.when(following).min() - reached <= GAP * np.median(np.diff(times)):  # of the last time may be more
@@ -175,6 +205,9 @@ def _of_file(file: Path, table: _Table, rows: int) -> Iterator[_Part]:
                 kept, later = when < times[-1], when >= reached
         yield _Part(name, [{k: column[kept] for k, column in part.items()}], int(kept.sum()))
         held = {k: column[later] for k, column in part.items()} if later.any() else {}
+        if reached is not None and held:  # what led there was counted
+            counted = table.when(held) == reached
+            held |= {k: np.where(counted, np.zeros_like(held[k]), held[k]) for k in table.costs if k in held}
 
 
 def _with_next(read: Iterator[Columns], rows: int) -> Iterator[tuple[Columns, Columns]]:
@@ -227,9 +260,14 @@ class _Growing:
         shapes = {name: array.shape[1:] for name, array in found.items()}
         if shapes != {name: array.shape[1:] for name, array in self.like.items()}:
             raise StoreError("it holds other entries or agents than the rows before; give tables of one kind.")
-        same = self.first.agents == card.agents
+        if store.n_agents > 1 and (card.agents is None or card.agents != self.first.agents):
+            raise StoreError(
+                "it is of other agents than the rows before, and rows of a team are of one agent each where tables are "
+                "read in parts; give neighbours (--neighbours 6), or a file for each team."
+            )
+        if far := coarse(store) if self.rows else []:
+            raise StoreError(f"it lies far from the rows before: {far[0]}")
         self.first = self.first.updated(
-            agents=card.agents if same else None,
             action_low=np.minimum(self.first.action_low, card.action_low).tolist(),
             action_high=np.maximum(self.first.action_high, card.action_high).tolist(),
         )

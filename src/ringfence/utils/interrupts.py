@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import select
+import shutil
 import signal
 import sys
 import threading
@@ -22,7 +23,7 @@ from socket import socket, socketpair
 STATUS = 130  # of a process that Ctrl-C ended
 MOMENT = 2.0  # s within which it is to be honoured
 BOUNCE = 0.3  # s within which it is one press that several processes tell of
-unfinished: set[Path] = set()  # files that are being written
+unfinished: set[Path] = set()  # files and folders that are being written
 _asked = False
 _honoured = False
 _held: list[object] = []
@@ -81,7 +82,7 @@ def _insist(told: socket) -> None:
                 break
     for file in list(unfinished):
         with suppress(OSError):
-            file.unlink()
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
     shown = "\033[?25h\n" * sys.stderr.isatty()  # the cursor, which a bar hides
     with suppress(OSError):  # whoever else writes may hold the streams
         os.write(2, f"{shown}interrupted\n".encode())

@@ -294,17 +294,23 @@ def batches(
     if kind not in (*PARQUET, ".csv") or not path.is_file() or (form.header and kind == ".csv"):
         yield read_columns(path, names_of(path, form) if wanted is None else wanted, form)
         return
-    needs("pyarrow")
+    pyarrow = needs("pyarrow")
     from pyarrow import csv, parquet
 
     with reading(path, "table that can be read", "write it again"):
+        whole: list[str] = []  # of which later rows may have points where the first have none
         if kind == ".csv":
-            there = csv.open_csv(path, **_of_csv(path, form)[1]).schema.names
+            schema = csv.open_csv(path, **_of_csv(path, form)[1]).schema
+            whole = [one.name for one in schema if pyarrow.types.is_integer(one.type)]
+            there = schema.names
         else:
             there = names_in(path)
+        twice = [name for name, times in Counter(there).items() if times > 1]
+        if twice:
+            raise StoreError(f"'{path}' has the column '{twice[0]}' twice; give every column its own name.")
         names = there if wanted is None else known(list(dict.fromkeys(wanted)), there)
         if kind == ".csv":
-            source, how = _of_csv(path, form, numbers, names)
+            source, how = _of_csv(path, form, {*whole, *numbers} - set(form.texts), names)
             read: Iterable[Any] = csv.open_csv(source, **how)
         else:
             read = parquet.ParquetFile(path).iter_batches(rows, columns=names)

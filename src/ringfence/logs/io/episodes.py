@@ -17,7 +17,7 @@ from ringfence.problem.others import others
 RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
 BLOCK = 2**22  # entries of observations that are made at once
 LARGEST = 2**30  # bytes of observations, above which they are refused unless the table itself is
-TIMES = 8  # the bytes of the table
+TIMES = 100  # the bytes of the table: of twenty agents they are forty
 
 
 @dataclass(frozen=True, eq=False)

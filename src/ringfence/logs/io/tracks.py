@@ -24,7 +24,8 @@ COHERENT = 0.3  # length of the mean phase of rows that share a clock, nearly ev
 SLIPS = 0.25  # of a step, above which rows are put on whole steps
 OFF = 0.01  # of a step, above which it is said
 FEW = 5  # rows whose times were rounded another way than most, below which none was: rows were lost
-COARSEST = 0.8  # of a step, to which times may be rounded; coarser ones are those of a clock that lost rows
+COARSEST = 0.62  # of a step, to which times may be rounded; coarser ones are of a clock that lost a third of its rows,
+SINGLE = 0.8  # but those of single precision, which are rounded to powers of two
 FINEST = 1000  # steps between two rows: more are another unit of time
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 STEADY = 0.5  # length of the mean phase of rows that keep their place between steps
@@ -81,7 +82,8 @@ def unrounded(rows: Rows) -> tuple[Rows, list[str]]:
     apart = np.diff(rows.time)[rows.follows]
     usual = apart[np.abs(apart - rows.step) < 1.5 * unit]
     mean = better = float(usual.mean()) if len(usual) else rows.step  # the mean of all where no row is lost
-    if (np.abs(usual - rows.step) > unit / 2).sum() < FEW or not DIGITS * mean < unit <= COARSEST * mean:
+    coarsest = SINGLE if unit and np.log2(unit) % 1 == 0 else COARSEST
+    if (np.abs(usual - rows.step) > unit / 2).sum() < FEW or not DIGITS * mean < unit <= coarsest * mean:
         return rows, []
     track = np.cumsum(np.append(True, ~rows.follows))
     for lag in 10 ** np.arange(1, np.log10(np.bincount(track).max())).astype(int):
