@@ -95,7 +95,7 @@ def test_a_group_is_no_array(tmp_path, name):
         ('{"hazard": "near"}', "hazard='near'; it must be"),
         ('{"hazard": {"kind": "All", "hazards": [3]}}', "which is none"),
         ('{"hazard": {"kind": []}}', "Unknown hazard"),
-        ('{"hazard": {"kind": "Separation", "radius": null}}', "which is none"),
+        ('{"hazard": {"kind": "Separation", "radius": null}}', "radius is a NoneType; give a number"),
         ('{"hazard": {"kind": "SpeedLimit", "limit": 1, "features": 3}}', "which is none"),
         ('{"task": 3}', "task=3; it must be a name without slashes"),
         ('{"task": null}', "task=None"),
