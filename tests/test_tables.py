@@ -887,3 +887,23 @@ def test_points_and_flags_that_come_later_in_a_csv_are_read(tmp_path):
         [file], tmp_path / "o.h5", rows=100_000, quiet=True, time="t", agent="id", state=["x"], terminated="over"
     )
     assert made.steps > 390_000 and EpisodeStore.load(tmp_path / "o.h5").terminated.sum() > 7000
+
+
+def test_of_a_file_that_cannot_hold_what_it_claims_nothing_is_read(tmp_path):
+    """However little of it is asked for."""
+    import h5py
+
+    store = EpisodeStore.from_table(fleet(), **NAMES)
+    file = store.save(tmp_path / "bomb.h5")
+    with h5py.File(file, "r+") as f:
+        for name in set(f) - {"episode_ends"}:
+            shape = (10**8 + store.episodes * (name == "observations"), *f[name].shape[1:])
+            del f[name]
+            f.create_dataset(name, shape, np.float32, chunks=(10**5, *shape[1:]), compression="gzip")
+    with pytest.raises(StoreError, match="claims"):
+        EpisodeStore.load(file, memory=2**20)
+    other = store.save(tmp_path / "ends.h5")
+    with h5py.File(other, "r+") as f:
+        f["episode_ends"][0] = 0
+    with pytest.raises(StoreError, match="episode_ends of '.*ends.h5' do not increase"):
+        EpisodeStore.load(other, memory=2**10)

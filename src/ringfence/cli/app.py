@@ -714,7 +714,7 @@ def _store(data: str) -> EpisodeStore:
     if Path(data).suffix in (".h5", ".hdf5", ".hdf") or Path(data).is_file() or len(Path(data).parts) > 1:
         store = EpisodeStore.load(data, LEARNED)
         if store.card.warnings and store.card.warnings[-1].startswith("learned from"):
-            out.print(f"[yellow]note[/] {store.card.warnings[-1]}", soft_wrap=True)
+            out.print(terminal(f"note {store.card.warnings[-1]}"), soft_wrap=True)
         return store
     return make(registry.get(data), must_keep=False)[0]
 

@@ -61,7 +61,7 @@ def import_large(
         with Progress("rows", max(1, sum(rows_of(Path(file)) for file in files)), quiet=quiet) as progress:
             for part in _parts(files, table, rows):
                 try:
-                    kept.add(table.store(part.tables, card or {}, kept.first))
+                    kept.add(table.store(part.tables, card or {}, kept.first, kept.team))
                 except StoreError as error:
                     raise StoreError(f"{part.name}: {error}") from None
                 progress.advance(part.rows)
@@ -127,8 +127,8 @@ class _Table:
         """(M,) recordings of rows."""
         return np.zeros(len(columns[self.time]), int) if self.episode is None else words(columns, self.episode)
 
-    def store(self, tables: list[Columns], card: Mapping[str, Any], first: StoreCard | None) -> EpisodeStore:
-        """The store of a part, in steps, teams and origins as in the first one."""
+    def store(self, tables: list[Columns], card: Mapping[str, Any], first: StoreCard | None, team: int) -> EpisodeStore:
+        """The store of a part, in steps, teams of so many agents and origins as in the first one."""
         found: Any = tables
         schema = TableSchema.of(self.options) if self.layout is None else None
         if self.layout is not None:
@@ -136,13 +136,9 @@ class _Table:
         assert schema is not None
         if first is None:
             return EpisodeStore.of_read(read_table(found, schema, card=card))
-        team = None if schema.homogeneous else first.extra[TEAM]
         origins = np.array(first.observation_origins or np.zeros(len(first.observation_names or ())))
-        found = read_table(found, replace(schema, dt=first.dt, team=team), card=card, origins=origins)
-        return EpisodeStore.of_read(found)
-
-
-TEAM = "agents of a team"  # of the first part
+        same = replace(schema, dt=first.dt, team=None if schema.homogeneous else team)
+        return EpisodeStore.of_read(read_table(found, same, card=card, origins=origins))
 
 
 @dataclass(frozen=True)
@@ -243,6 +239,11 @@ class _Growing:
         self.of_team = True  # whether all agents have the same costs
         self.notes: dict[str, list[str]] = {}  # by what they say, but for numbers
 
+    @property
+    def team(self) -> int:
+        """How many agents it is of; 0 of none so far."""
+        return self.like["actions"].shape[1] if self.like else 0
+
     def add(self, store: EpisodeStore) -> None:
         """Its episodes after those of before."""
         each = store.costs.ndim == 2
@@ -255,7 +256,7 @@ class _Growing:
         found["episode_ends"] = found["episode_ends"] + self.rows.get("actions", 0)
         card = store.card
         if self.first is None:
-            self.first = card.updated(**{TEAM: n})
+            self.first = card
             self.like = {name: array[:0] for name, array in found.items()}
         shapes = {name: array.shape[1:] for name, array in found.items()}
         if shapes != {name: array.shape[1:] for name, array in self.like.items()}:
@@ -288,8 +289,7 @@ class _Growing:
             said[0] if len(set(said)) == 1 else f"{said[0]} (and so in {len(said) - 1} parts more)"
             for said in self.notes.values()
         ]
-        fields = {k: v for k, v in self.first.to_dict().items() if k != TEAM}
-        card = StoreCard().updated(**fields | {"warnings": notes})
+        card = self.first.updated(warnings=notes)
         write(path, card, {name: self._pieces(name) for name in self.like})
         return Written(card, self.rows["episode_ends"], self.rows["actions"])
 

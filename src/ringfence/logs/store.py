@@ -518,7 +518,7 @@ class EpisodeStore:
             card = schemas.decode(raw, dict[str, Any])
             size = sum(array.nbytes for array in there.values())
             steps = len(there["actions"])
-            some = _sampled(there, memory * steps // size, seed) if memory is not None and size > memory else None
+            some = _sampled(path, there, memory * steps // size, seed) if memory is not None and size > memory else None
             content = {name: array[()] if some is None else some.of(name, array) for name, array in there.items()}
         try:
             found = cls(**content, card=complete_card(card))
@@ -595,12 +595,14 @@ class _Sample:
         return np.concatenate([array[begin:end] for begin, end in spans])
 
 
-def _sampled(there: Mapping[str, h5py.Dataset], steps: int, seed: int) -> _Sample:
+def _sampled(path: Path, there: Mapping[str, h5py.Dataset], steps: int, seed: int) -> _Sample:
     """Episodes of so many steps at most, and one at least."""
     ends = there["episode_ends"][()].astype(np.int64)
     lengths = np.diff(ends, prepend=0)
     if (lengths <= 0).any() or ends[-1] != len(there["actions"]):
-        raise StoreError("its episode_ends do not increase to the number of its steps; make or import it again")
+        raise StoreError(
+            f"The episode_ends of '{path}' do not increase to the number of its steps; make or import it again."
+        )
     count = max(1, 2**24 // max(1, int(np.prod(there["costs"].shape[1:], dtype=int))))
     costly = [team(there["costs"][begin : begin + count]) > 0 for begin in range(0, ends[-1], count)]
     danger = np.logical_or.reduceat(np.concatenate(costly), ends - lengths)
@@ -634,8 +636,8 @@ def _checked(path: Path, f: h5py.File, whole: bool) -> dict[str, h5py.Dataset]:
                 f"'{path}' holds {array.shape[0]} rows of '{name}' for {steps} steps of {episodes} episodes; make or "
                 "import the store again."
             )
-    if whole:
-        arrays.affordable(path, sum(array.nbytes for array in found.values()), PACKED)
+    refuse = arrays.affordable if whole else arrays.possible
+    refuse(path, sum(array.nbytes for array in found.values()), PACKED)
     return found
 
 

@@ -44,6 +44,11 @@ def affordable(path: Path, size: int, ratio: int = PACKED, stored: int | None = 
     """Refuse arrays of `size` bytes that memory cannot take, or that a file of its size (`stored` bytes, that of
     `path` by default) cannot hold though it were compressed `ratio` to one."""
     fits(path, size)
+    possible(path, size, ratio, stored, loose)
+
+
+def possible(path: Path, size: int, ratio: int = PACKED, stored: int | None = None, loose: int = LOOSE) -> None:
+    """Refuse arrays of `size` bytes that a file cannot hold, likewise, however much memory there is."""
     stored = path.stat().st_size if stored is None else stored
     if size > ratio * stored + loose:
         raise StoreError(

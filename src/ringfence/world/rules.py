@@ -102,10 +102,10 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
         alike = (one for one, loss in zip(likely, losses) if loss <= (1 + AS_LIKELY) * min(losses))
         terms = [*terms, min(alike, key=lambda one: not isinstance(one, Entry))]
         likely.remove(terms[-1])
-        found, at = whole.refined(terms, few.likeliest(terms, raw=True)[1])
+        numbers = whole.of_quantities(terms)
+        found, at = whole.refined(numbers, few.likeliest(terms, raw=True)[1])
         old, weights = conditions[k], tuple(float(w) for w in found)
         new = Sum((*old.parts, *terms), (*old.weights, *weights), float((old.more or 0.0) - at))
-        numbers = whole.of_quantities(terms)
         alone = replace(whole, values=np.zeros_like(whole.values)).best(numbers, found)
         needless = alone[0] <= whole.best(numbers, found)[0] + NEEDLESS * whole.bad.sum()
         if needless and max(map(how_many, [*terms, *conditions[:k], *conditions[k + 1 :]])) == one.cause.things:
@@ -215,9 +215,9 @@ class _Near:
         weights[usable] = found.x[1:-1] / max(abs(found.x[0]), 1e-6) * (unit / spread[usable] if raw else 1.0)
         return float(found.fun), weights
 
-    def refined(self, quantities: Sequence[Quantity], weights: np.ndarray) -> tuple[np.ndarray, float]:
-        """Weights of quantities by which fewest steps are told wrongly, each in turn, and where danger begins."""
-        numbers, at = self.of_quantities(quantities), 0.0
+    def refined(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+        """Weights of numbers (M, K) by which fewest steps are told wrongly, each in turn, and where danger begins."""
+        at = 0.0
         for factor in RATIOS[1:]:
             for k in range(len(weights)):
                 tried = [np.where(np.arange(len(weights)) == k, weights * factor**i, weights) for i in range(-3, 4)]

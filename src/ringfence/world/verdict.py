@@ -27,8 +27,9 @@ PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that ar
 LITTLE = 0.9  # of what could be avoided: where the judged rows avoid less, V sees in time what they do not
 HALF = 0.5  # likewise, of what the farthest look avoids that is usual
 FOR_ONCE = 30  # rows of a look that is farther than that
-BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
-# and causes that read it are known ahead: with rays, of which 53 % and 87 % are not, guards left 33 to 52 % of episodes
+# Error of predictions as a share of what changes, or of what is read, up to which more rows count. Where causes read
+# what is predicted worse, of rays by 53 % and 87 %, guards left 33 to 52 % of episodes.
+BEARABLE = 0.3
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
 FORMULA = "give a formula of danger (hazard)"
 
