@@ -44,8 +44,7 @@ from ringfence.world.card import (
     Verdict,
 )
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
-from ringfence.world.causes import Cause, Edge, Found
-from ringfence.world.cells import Cells
+from ringfence.world.causes import Cause, Cells, Edge, Found
 from ringfence.world.dynamics import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
 from ringfence.world.quantities import Entry, Length

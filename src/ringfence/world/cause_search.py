@@ -31,8 +31,7 @@ from ringfence.world.cause_counts import (
     some_steps,
     within,
 )
-from ringfence.world.causes import Cause, Edge, Found, narrowed, only_of, only_where
-from ringfence.world.cells import CELLS, Cells
+from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found, narrowed, only_of, only_where
 from ringfence.world.quantities import Entry, Length, Over, Quantity, leaves
 from ringfence.world.rules import rules_of, tilted_of, weighted_of
 

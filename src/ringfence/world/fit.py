@@ -35,8 +35,7 @@ from ringfence.world import cause_search, dynamics, impacts, judging, margins, v
 from ringfence.world.card import Card, Data, Settings
 from ringfence.world.cause_candidates import offsets
 from ringfence.world.cause_nets import fit_causes
-from ringfence.world.causes import Found
-from ringfence.world.cells import Cells
+from ringfence.world.causes import Cells, Found
 from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World, blank_world

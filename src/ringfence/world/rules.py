@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
-from ringfence.world.causes import Cause
-from ringfence.world.cells import VISITED, Cells
+from ringfence.world.causes import VISITED, Cause, Cells
 from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many
 
 SWEEPS = 4  # in which every threshold is looked for in turn
