@@ -136,7 +136,7 @@ def _remedy_of_untold(card: Card) -> str:
     names = () if card.prediction_error is None else card.prediction_error.by_entry
     if not names or any(UNNAMED.match(name) for name in names):
         return "name the entries that tell danger, or log them"
-    return f"log what tells danger, if it is not among the entries, or {FORMULA}"
+    return f"{FORMULA}, which may be of a form that no rule has, or log what tells danger"
 
 
 def _avoided(scores: BarrierScores) -> float:
