@@ -20,9 +20,9 @@ import numpy as np
 
 from ringfence.envs import discs
 from ringfence.envs.base import Defaults
-from ringfence.envs.sight import approaches
 from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap, decentralized
+from ringfence.problem.partners import approaches
 from ringfence.types import Array, Key, Transition
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from ringfence.envs import film
 from ringfence.envs.base import Outcome, Seed, Seen
 from ringfence.errors import UserError, unknown
 from ringfence.problem.features import VIEWS, FeatureMap, Source
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 from ringfence.types import Array
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ import numpy as np
 from ringfence.envs.base import Defaults
 from ringfence.errors import UserError, unknown
 from ringfence.problem.features import VIEWS, FeatureMap, derived, following
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.base import Defaults
-from ringfence.envs.sight import approaches
 from ringfence.envs.simple_spread import DT, SimpleSpread, SpreadState, in_contact
 from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap, decentralized
+from ringfence.problem.partners import approaches
 from ringfence.types import Array, Key, Transition
 
 SIGHT = 1.5  # m: in a room of 2 m a side, one thing in six is farther away, so what is not there is nothing new

@@ -23,7 +23,7 @@ from ringfence.evaluation.rollout import COUNTED, RESETS, Acting
 from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
 from ringfence.problem.bounds import Bounds
-from ringfence.problem.names import Names
+from ringfence.problem.entries import Names
 from ringfence.training.runs import Run
 from ringfence.types import Key
 from ringfence.utils import interrupts

@@ -21,12 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.problem import on_map, partners, turns
+from ringfence.problem import motion, on_map, partners
 from ringfence.problem.entries import Entries, axes_of
-from ringfence.problem.kinematics import late_share
-from ringfence.problem.others import order_in, others
-from ringfence.problem.partners import Mirrored
-from ringfence.problem.turns import Turn
+from ringfence.problem.motion import Turn, late_share
+from ringfence.problem.partners import Mirrored, order_in, others
 from ringfence.types import Array, X
 
 View = Literal["pruned", "centralized", "decentralized"]
@@ -137,7 +135,7 @@ class FeatureMap:
 
     def apart(self, after: X, before: X) -> X:
         """(..., D) how far features are from others; of angles, the shorter way round."""
-        return turns.apart(self.turns, after, before)
+        return motion.apart(self.turns, after, before)
 
     def agreed(self, plan: Array, history: int = 0) -> Array:
         """Plans (B, history + H, N, D) whose agents agree on where everybody will be, where the view knows how."""
@@ -388,7 +386,7 @@ def from_data(
     plain = _pruned_map(view, observations, state, observation_names, state_names, first_rows, set(keep), team)
     steps = _logged_steps(plain, observations, state, first_rows)
     if steps is not None:
-        plain = replace(plain, turns=turns.found_in(steps.before, steps.after))
+        plain = replace(plain, turns=motion.turns_in(steps.before, steps.after))
     if view == "centralized":
         return plain
     if homogeneous and not axes_of(Entries.of(plain.names).own, "{}"):

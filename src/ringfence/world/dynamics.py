@@ -24,9 +24,9 @@ from ringfence.nets.optim import regress
 from ringfence.problem import partners
 from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
+from ringfence.problem.motion import pointing, within
 from ringfence.problem.normalise import varying
-from ringfence.problem.others import others
-from ringfence.problem.turns import pointing, within
+from ringfence.problem.partners import others
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
 from ringfence.world.settings import Settings

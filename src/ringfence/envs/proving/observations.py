@@ -10,7 +10,7 @@ import numpy as np
 from ringfence.envs.proving.bodies import Motion
 from ringfence.envs.proving.dangers import BY_PLACE
 from ringfence.envs.proving.layout import Layout, SystemState
-from ringfence.envs.sight import approaches
+from ringfence.problem.partners import approaches
 from ringfence.types import Array
 
 SIGHT = 3.0  # m; who is farther away is not seen, where not all are observed

@@ -12,7 +12,7 @@ from ringfence.errors import StoreError
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Tracks, cut, is_first, nearest, teams
 from ringfence.problem.entries import SPACE
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 
 RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
 BLOCK = 2**22  # entries of observations that are made at once

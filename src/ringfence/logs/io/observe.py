@@ -13,7 +13,7 @@ from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.io.units import angle_of
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import SPACE, Entries, Entry
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 from ringfence.utils.given import given_as, refuse_other_order
 
 
