@@ -35,7 +35,6 @@ REFERENCE = {
     "Logs": (
         "ringfence.logs.store",
         "ringfence.logs.late",
-        "ringfence.problem.layout",
         "ringfence.datasets.make",
         "ringfence.datasets.audit",
     ),

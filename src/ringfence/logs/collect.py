@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, is_vector, made
+from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, SideBySide, is_vector, made
 from ringfence.envs.padded import PaddedEnv
 from ringfence.envs.rollout import Memoryless, Moment, rollout
-from ringfence.envs.side_by_side import SideBySide
 from ringfence.errors import Interrupted, StoreError, UserError, known, of_kind, whole_number
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore

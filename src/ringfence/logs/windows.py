@@ -16,7 +16,7 @@ import numpy as np
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import normalise
 from ringfence.types import Array, Batch, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 
 NOT_ARRIVED = -1.0  # cost of an episode's first row: nothing was charged on arriving there, so nobody knows
 

@@ -22,7 +22,7 @@ from typing import Any
 import jax
 
 from ringfence.errors import UserError
-from ringfence.utils.cache import cache_dir
+from ringfence.utils.files import cache_dir
 
 VARIABLE = "RINGFENCE_COMPILATION_CACHE"
 # JAX's options: what they are by default, and here. What was not used for longest goes first. JAX looks through

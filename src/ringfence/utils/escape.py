@@ -6,12 +6,18 @@ takes what no page can hold out of both.
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from rich.text import Text
 
 from ringfence.errors import plain
+from ringfence.utils.files import whole
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -83,3 +89,16 @@ def markdown(text: str) -> str:
 def shell(word) -> str:
     """One word of a command."""
     return shlex.quote(plain(str(word)))
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> Path:
+    """One line for each row, of these columns; what a row lacks is empty, numbers have six digits."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, columns, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        cells = {name: row.get(name, "") for name in columns}
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else spreadsheet(v) for k, v in cells.items()})
+    with whole(path) as temporary:
+        temporary.write_text(buffer.getvalue())
+    return path

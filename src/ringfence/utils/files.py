@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; a folder belongs to one process at a time."""
+"""Files appear whole or not at all; a folder belongs to one process at a time. What can be made again has its place."""
 
 from __future__ import annotations
 
@@ -13,15 +13,36 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+import platformdirs
 from filelock import FileLock
 
 from ringfence.errors import UserError, reading
 from ringfence.utils import interrupts
-from ringfence.utils.cache import elsewhere
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
 LONGEST = 200  # bytes of a name: what is written beside it has a longer one
 LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
+
+
+def cache_dir() -> Path:
+    """$RINGFENCE_HOME, else the user's cache folder."""
+    if home := os.environ.get("RINGFENCE_HOME"):
+        return Path(home)
+    try:
+        found = platformdirs.user_cache_path("ringfence", appauthor=False)
+    except RuntimeError:
+        found = Path("~")  # as older versions leave it where nobody knows the user's home
+    if not found.is_absolute():
+        raise UserError("This user has no home folder to keep data in; set RINGFENCE_HOME to a folder.")
+    return found
+
+
+def elsewhere(path: Path) -> str:
+    """What helps where a file cannot be written: who chose its place chooses another."""
+    with suppress(UserError):
+        if path.absolute().is_relative_to(cache_dir().absolute()):
+            return "set RINGFENCE_HOME to another folder"
+    return "choose another place"
 
 
 @contextmanager

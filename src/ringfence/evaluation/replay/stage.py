@@ -23,7 +23,7 @@ from ringfence.guards import Guard
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import held
 from ringfence.types import Array, Policy, PolicyStep, PyTree
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.utils.progress import Progress
 from ringfence.world import World
 

@@ -18,7 +18,7 @@ from ringfence.errors import StoreError, UserError, one_of, reading
 from ringfence.logs.io.columns import Columns, Table, by_entry, known, needs, numbers, stacked
 from ringfence.logs.io.formats import names_in, read_parquet
 from ringfence.utils import schemas
-from ringfence.utils.natural import natural
+from ringfence.utils.numbers import natural
 
 INFO = "meta/info.json"
 LARGEST = 2**24  # bytes of meta/info.json

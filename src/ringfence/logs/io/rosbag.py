@@ -17,7 +17,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.bagfile import ROLES, SHOWN, BagFile, Topic, joined, opened, topic_name
-from ringfence.utils.natural import natural
+from ringfence.utils.numbers import natural
 
 TWIST = ("vx", "vy", "wz")
 COMMAND = ("cmd_vx", "cmd_vy", "cmd_wz")

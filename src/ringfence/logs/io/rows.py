@@ -11,7 +11,7 @@ import numpy as np
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.utils.natural import numbered
+from ringfence.utils.numbers import numbered
 
 COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
 LONG = 5.0  # s, a step that hardly any controller has

@@ -8,7 +8,8 @@ follows from what (docs/import.md).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,12 +47,12 @@ from ringfence.logs.io.rows import (
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample, unrounded
 from ringfence.logs.io.units import in_metres, without_angles
-from ringfence.logs.io.wide import read_wide
 from ringfence.logs.moving import looked_at, origins_of
 from ringfence.problem.constraints import CostColumn
 
 USUAL = 0.999  # of accelerations, that are no outliers
 RECORDING = "ringfence.recording"  # column that tells apart what is of several tables
+AGENT, COLUMN = "{agent}", "{column}"  # in how wide tables call columns
 STANDS_OUT = 2.0  # times that, above which the largest are outliers
 
 
@@ -239,7 +240,7 @@ def _columns_of(table: Table, schema: TableSchema, whose: str) -> tuple[Columns,
     texts = [name for name in (schema.agent, schema.episode, schema.time_format and schema.time) if name]
     form = Form(schema.header, schema.decimal, tuple(theirs.get(name, name) for name in texts))
     if schema.wide is not None:
-        columns = read_wide(table, schema, theirs, form)
+        columns = _read_wide(table, schema, theirs, form)
     else:
         named = list(schema.columns)
         if schema.join and theirs.get(schema.agent, schema.agent) not in names_of(table, form):
@@ -437,3 +438,70 @@ def _rewards(motion: Motion, episodes: Episodes) -> np.ndarray:
         return motion.tracks.earned[episodes.rows]
     distance = np.linalg.norm(motion.to_goal, axis=1)[episodes.rows]
     return -np.diff(distance, axis=0, prepend=distance[:1])
+
+
+def _read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str], form: Form) -> Columns:
+    """The schema's columns of a table with columns for every agent, agent by agent. A column that no agent has of its
+    own is everybody's. Rows in which all of an agent's own columns are missing are left out: it was away. `theirs` are
+    names in the table, by ours."""
+    assert schema.wide is not None
+    shared = {name for name in (schema.time, schema.episode) if name}
+    asked = [name for name in schema.columns if name not in shared and name != schema.agent]
+    own = _owners(schema.wide, names_of(table, form), {name: theirs.get(name, name) for name in asked})
+    agents = list(dict.fromkeys(agent for columns in own.values() for agent in columns))
+    if not agents:
+        raise UserError(
+            f"wide='{schema.wide}' fits no column of {', '.join(asked[:5])}; write it with {AGENT} and {COLUMN} as the "
+            "table's columns are called."
+        )
+    for name, columns in own.items():
+        lacking = [agent for agent in agents if agent not in columns]
+        if columns and lacking:
+            column = schema.wide.replace(COLUMN, theirs.get(name, name)).replace(AGENT, lacking[0])
+            raise StoreError(
+                f"The agent '{lacking[0]}' has no column '{column}', and "
+                f" '{next(iter(columns))}' has; leave {name} out, or add it."
+            )
+    everybodys = {name: theirs.get(name, name) for name in (*shared, *(name for name in asked if not own[name]))}
+    read = read_columns(
+        table, [*everybodys.values(), *(column for columns in own.values() for column in columns.values())], form
+    )
+    parts = [_of_agent(agent, schema.agent, everybodys, own, read) for agent in agents]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _owners(wide: str, names: Iterable[str], asked: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """For every asked column, the table's columns of it by agent. A name that fits several is of the longest column:
+    `leadervx` is vx of `leader`, not x of `leaderv`."""
+    own: dict[str, dict[str, str]] = {name: {} for name in asked}
+    by_length = sorted(asked, key=lambda name: -len(asked[name]))
+    patterns: dict[str, re.Pattern[str]] = {}
+    for name in by_length:
+        before, after = wide.replace(COLUMN, asked[name]).split(AGENT)
+        patterns[name] = re.compile(f"{re.escape(before)}(?P<agent>.+){re.escape(after)}")
+    for column in names:
+        for name in by_length:
+            found = patterns[name].fullmatch(column)
+            if found:
+                own[name][found["agent"]] = column
+                break
+    return own
+
+
+def _of_agent(
+    agent: str, name_of_agent: str, everybodys: Mapping[str, str], own: dict[str, dict[str, str]], read: Columns
+) -> Columns:
+    columns = {name: read[column] for name, column in everybodys.items()}
+    mine = {name: read[columns_of[agent]] for name, columns_of in own.items() if columns_of}
+    there = ~np.stack([_missing(column) for column in mine.values()]).all(0)
+    rows = {name: column[there] for name, column in (columns | mine).items()}
+    return rows | {name_of_agent: np.full(int(there.sum()), agent)}
+
+
+def _missing(column: np.ndarray) -> np.ndarray:
+    """(M,) whether an entry is None or NaN."""
+    if column.dtype.kind == "f":
+        return np.asarray(np.isnan(column).reshape(len(column), -1).all(1))
+    if column.dtype.kind != "O":
+        return np.zeros(len(column), bool)
+    return np.array([entry is None or (isinstance(entry, float) and entry != entry) for entry in column], bool)
