@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ringfence.envs.proving.suite import DEVELOPMENT, TEST
+from ringfence.envs.proving.system import DEVELOPMENT, TEST
 from ringfence.problem import on_map
 from ringfence.problem.entries import loosely
 from ringfence.problem.inferred_names import inferred_names

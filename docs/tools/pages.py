@@ -58,7 +58,7 @@ REFERENCE = {
         "ringfence.evaluation.protocol",
         "ringfence.evaluation.play",
         "ringfence.evaluation.stress",
-        "ringfence.faults.faults",
+        "ringfence.faults",
         "ringfence.evaluation.certify",
         "ringfence.evaluation.certificate",
         "ringfence.evaluation.monitor",

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from ringfence.datasets.recipes import RECIPES
 from ringfence.datasets.registry import siblings
 from ringfence.datasets.task import Card, Recipe, Task
-from ringfence.datasets.version import RECIPES
 from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints

@@ -15,8 +15,7 @@ from pettingzoo import ParallelEnv
 
 from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
-from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread
-from ringfence.envs.spread_alike import SpreadAlike
+from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread, SpreadAlike
 from ringfence.errors import UserError
 
 LANDMARK_RADIUS = 0.05

@@ -7,9 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ringfence.envs.base import Seen
+from ringfence.envs.base import Moment, Seen, Watch, nobody
 from ringfence.envs.episode import Episode
-from ringfence.envs.rollout import Moment, Watch, nobody
 from ringfence.evaluation.recordings import Recording
 from ringfence.problem.entries import Names
 

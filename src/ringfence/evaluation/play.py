@@ -10,8 +10,8 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from ringfence.envs.base import Moment, Watch, nobody, rollout, split_off
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, SideBySide
-from ringfence.envs.rollout import Moment, Watch, nobody, rollout, split_off
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
 from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated

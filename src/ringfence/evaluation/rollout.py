@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs import rollout as outside
+from ringfence.envs import base as outside
 from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.errors import UserError
 from ringfence.faults.policy import Faulty

@@ -80,11 +80,14 @@ class Entries:
     @cached_property
     def each(self) -> tuple[Entry, ...]:
         """Every entry whose name says whose it is, in their order."""
-        found = [
-            _entry(whose, order, what, fields, d)
-            for (whose, order), fields in self.bodies.items()
-            for what, d in fields.items()
-        ]
+        found = []
+        for (whose, order), fields in self.bodies.items():
+            for what, d in fields.items():
+                match = _MOTION.fullmatch(what)
+                role, axis = "number", ""
+                if match and match[2] in axes_of(fields, match[1] + "{}"):
+                    role, axis = _ROLES[match[1]], match[2]
+                found.append(Entry(whose, order, what, role, axis, d))
         return tuple(sorted(found, key=lambda entry: entry.source))
 
     @cached_property
@@ -134,16 +137,7 @@ class Entries:
         return next((self.own[word] for word in SPEEDS if word in self.own), None)
 
 
-@functools.lru_cache(256)
-def _entries(names: tuple[str, ...]) -> Entries:
-    return Entries(names)
-
-
-def _entry(whose: str, order: int | None, what: str, fields: Collection[str], source: int) -> Entry:
-    match = _MOTION.fullmatch(what)
-    if match is None or match[2] not in axes_of(fields, match[1] + "{}"):
-        return Entry(whose, order, what, "number", "", source)
-    return Entry(whose, order, what, _ROLES[match[1]], match[2], source)
+_entries = functools.lru_cache(256)(Entries)
 
 
 @dataclass(frozen=True, eq=False)

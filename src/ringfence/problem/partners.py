@@ -39,6 +39,34 @@ def others(n: int, most: int | None = None) -> np.ndarray:
     return (before + (before >= np.arange(n)[:, None])).astype(int)
 
 
+def approaches(position: Array, velocity: Array, sight: float, soon: float) -> tuple[Array, Array, Array]:
+    """Offsets and relative velocities (B, N, N, 2) of everybody to everybody, and the squared distance (B, N, N) of
+    their nearest approach within `soon` s if all go on as now: beyond all others for who is out of `sight` m, and
+    beyond these for oneself."""
+    offset = position[..., None, :, :] - position[..., :, None, :]
+    speed = velocity[..., None, :, :] - velocity[..., :, None, :]
+    when = jnp.clip(-(offset * speed).sum(-1) / ((speed**2).sum(-1) + 1e-9), 0.0, soon)
+    squared = ((offset + when[..., None] * speed) ** 2).sum(-1)
+    in_sight = (offset**2).sum(-1) < sight**2
+    squared = jnp.where(in_sight, squared, 1e6) + 1e9 * jnp.eye(position.shape[-2])
+    return offset, speed, squared
+
+
+def seen_first(order: Array, shown: int, things: int, sight: float, offset: Array, *more: Array) -> Array:
+    """(..., N, shown (F + 1)) of the things at `offset` (..., N, M, 2) those that come first by `order` (..., N, M):
+    where each is, what `more` there is to tell (..., N, M, F - 2), and whether it is in sight. What is not seen stands
+    at the end of `sight` m. Only `things` of the M are things."""
+    count = min(shown, things)
+    _, which = jax.lax.top_k(-order, count)
+    near, *rest = (jnp.take_along_axis(x, which[..., None], -2) for x in (offset, *more))
+    rows = jnp.concatenate([near, *rest, jnp.ones_like(near[..., :1])], -1)
+    unseen = np.zeros(rows.shape[-1], np.float32)
+    unseen[0] = sight
+    rows = jnp.where((near**2).sum(-1, keepdims=True) < sight**2, rows, unseen)
+    missing = jnp.broadcast_to(unseen, (*rows.shape[:-2], shown - count, len(unseen)))
+    return jnp.concatenate([rows, missing], -2).reshape(*rows.shape[:-2], -1)
+
+
 def order_in(change: np.ndarray, how: Mapping[int, tuple[int, int]]) -> np.ndarray | None:
     """(N, J) who the others of each agent are, as changes (W, N, D) of entries tell: `other0.dx` changes by as much as
     that other's `own.x` less one's own. `how` has the entries: (the own one, which other it is about). None where the
@@ -68,19 +96,6 @@ def _off(change: np.ndarray, agent: int, told: Iterable[tuple[int, int]], who: I
         wrong = np.quantile(np.abs((mine + change[:, agent, own])[:, None] - change[:, who, own]), SHARE, axis=0)
         least = np.minimum(least, np.where(size > LEAST, wrong / max(size, LEAST), np.inf))
     return np.where(np.array(who) == agent, np.inf, least)
-
-
-def approaches(position: Array, velocity: Array, sight: float, soon: float) -> tuple[Array, Array, Array]:
-    """Offsets and relative velocities (B, N, N, 2) of everybody to everybody, and the squared distance (B, N, N) of
-    their nearest approach within `soon` s if all go on as now: beyond all others for who is out of `sight` m, and
-    beyond these for oneself."""
-    offset = position[..., None, :, :] - position[..., :, None, :]
-    speed = velocity[..., None, :, :] - velocity[..., :, None, :]
-    when = jnp.clip(-(offset * speed).sum(-1) / ((speed**2).sum(-1) + 1e-9), 0.0, soon)
-    squared = ((offset + when[..., None] * speed) ** 2).sum(-1)
-    in_sight = (offset**2).sum(-1) < sight**2
-    squared = jnp.where(in_sight, squared, 1e6) + 1e9 * jnp.eye(position.shape[-2])
-    return offset, speed, squared
 
 
 class Mirrored(NamedTuple):

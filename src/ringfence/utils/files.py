@@ -57,7 +57,10 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(path)
+        for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):  # whose writers may be gone
+            writer = part.name.removesuffix(".part").rpartition(".")[2]
+            if writer.isdigit() and not _alive(int(writer)):
+                _remove(part)
         interrupts.unfinished.add(temporary)
         temporary.touch()
         mode = temporary.stat().st_mode & 0o777  # the umask itself can only be read by changing it for all threads
@@ -131,14 +134,6 @@ def within(folder: str | os.PathLike, path: str | os.PathLike) -> Path:
     if not Path(path).resolve().is_relative_to(Path(folder).resolve()):
         raise ValueError(f"it is a link out of '{folder}'")
     return Path(path)
-
-
-def _sweep(path: Path) -> None:
-    """Remove parts of this file whose writers are gone."""
-    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        writer = part.name.removesuffix(".part").rpartition(".")[2]
-        if writer.isdigit() and not _alive(int(writer)):
-            _remove(part)
 
 
 def _alive(process: int) -> bool:

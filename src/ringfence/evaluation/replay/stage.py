@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.base import Outcome, Seed, Seen
-from ringfence.envs.rollout import Memoryless, Moment, rollout, split_off
+from ringfence.envs.base import Memoryless, Moment, Outcome, Seed, Seen, rollout, split_off
 from ringfence.errors import UserError
 from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit

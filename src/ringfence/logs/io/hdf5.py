@@ -7,9 +7,9 @@
             rewards, terminations, truncations (T,)
 
 The names and shapes are those of the repositories liuzuxin/DSRL (`dsrl/offline_env.py`, Liu et al. 2023),
-Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020) and Farama-Foundation/Minari (`minari/dataset/_storages/hdf5_storage.py`; older
-versions keep the metadata in the file's attributes; groups are joined in the order of their names). What the files do
-not say, and is done here:
+Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020) and Farama-Foundation/Minari
+(`minari/dataset/_storages/hdf5_storage.py`; older versions keep the metadata in the file's attributes; groups are
+joined in the order of their names). What the files do not say, and is done here:
 
 * the state that an episode's last step led to is in `next_observations` or, with Minari, in the last row. D4RL's files
   without it give up the last step of every episode, whose own observation becomes the last state; since nothing is
@@ -136,7 +136,11 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
     arrays.affordable(path, sum(array.nbytes for array in found.values()))
 
     terminals, timeouts = (common.flags(path, name, found[name], rows) for name in ("terminals", "timeouts"))
-    ends = _ends(path, terminals | timeouts)
+    ends = np.flatnonzero(terminals | timeouts) + 1
+    if not len(ends):
+        raise StoreError(
+            f"'{path}' marks no end of an episode in its {rows} rows; set terminals or timeouts at their last steps."
+        )
     kept = int(ends[-1])
     notes = common.flattened(found["observations"].shape, found["actions"].shape)
     if kept < rows:
@@ -167,17 +171,6 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
         observations, actions, rewards = observations[steps], actions[steps], rewards[steps]
         terminated = np.zeros(len(ends), bool)
     return common.Logs(layout, observations, final, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
-
-
-def _ends(path: Path, last: np.ndarray) -> np.ndarray:
-    """(E,) where episodes end, of rows (T,) that are marked as their last."""
-    ends = np.flatnonzero(last) + 1
-    if not len(ends):
-        raise StoreError(
-            f"'{path}' marks no end of an episode in its {len(last)} rows; set terminals or timeouts at their last "
-            "steps."
-        )
-    return ends
 
 
 def _flat_widths(path: Path, found: dict[str, h5py.Dataset]) -> tuple[int, int]:
@@ -263,7 +256,9 @@ def _of_episodes(path: Path, f: h5py.File, episodes: list[str], asked: common.As
     found = {name: _shapes(path, f, name) for name in episodes}
     first = found[episodes[0]]
     _check_alike(path, found, episodes[0])
-    seen, acted = _widths(path, first)
+    seen, acted = (sum(math.prod(s) for s in x.values()) for x in (first.observations, first.actions))
+    if not seen or not acted:
+        raise StoreError(f"'{path}' has {seen} observation and {acted} action entries; both must be 1 or more.")
     if asked.agents is not None:
         common.check_agents(path, asked.agents, seen, acted)
     bounds = common.bounds_of(_action_space(path, metadata, asked, acted), asked, acted)
@@ -318,14 +313,6 @@ def _check_alike(path: Path, found: dict[str, Shapes], of: str) -> None:
                 f"'{path}' has '{name}' with other {'infos/cost' if kind == 'cost' else kind} than '{of}'; "
                 "all episodes must hold the same arrays."
             )
-
-
-def _widths(path: Path, shapes: Shapes) -> tuple[int, int]:
-    """Entries of an observation and of an action."""
-    seen, acted = (sum(math.prod(s) for s in x.values()) for x in (shapes.observations, shapes.actions))
-    if not seen or not acted:
-        raise StoreError(f"'{path}' has {seen} observation and {acted} action entries; both must be 1 or more.")
-    return seen, acted
 
 
 def _with_steps(path: Path, found: dict[str, Shapes], notes: list[str]) -> dict[str, Shapes]:
