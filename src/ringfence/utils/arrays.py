@@ -92,11 +92,16 @@ class _Patient(io.FileIO):
 
 def fits(path: Path, size: int) -> None:
     """Refuse arrays of `size` bytes that memory cannot take."""
-    names = getattr(os, "sysconf_names", {})
-    known = "SC_PHYS_PAGES" in names and "SC_PAGE_SIZE" in names  # else the system does not say
-    memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) if known else float("inf")
+    memory = _memory()
     if size > memory:
         raise StoreError(
             f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB of memory; "
             "take a larger machine, or store fewer episodes."
         )
+
+
+def _memory() -> float:
+    """Bytes of memory, infinite where the system does not say."""
+    names = getattr(os, "sysconf_names", {})
+    known = "SC_PHYS_PAGES" in names and "SC_PAGE_SIZE" in names
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) if known else float("inf")
