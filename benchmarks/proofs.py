@@ -22,8 +22,8 @@ from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS
 from ringfence.deploy import zoo
 from ringfence.evaluation.stress import stress
-from ringfence.nets.bounds import Inputs, output_bounds
-from ringfence.nets.mlp import MLP
+from ringfence.guards.proof import Inputs, output_bounds
+from ringfence.nets.layers import MLP
 from ringfence.training import worlds
 
 RUN = "crossing-hasty/bc"

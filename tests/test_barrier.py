@@ -14,7 +14,7 @@ from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData, at, draw
 from ringfence.nets import MLP
-from ringfence.nets.heads import barrier_on
+from ringfence.nets.layers import barrier_on
 from ringfence.problem import constraints, normalise
 from ringfence.proposals import retention as cbf
 from ringfence.proposals.diffusion import cosine_schedule

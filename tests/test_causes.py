@@ -44,8 +44,7 @@ from ringfence.world.card import (
     Verdict,
 )
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
-from ringfence.world.causes import Cause, Edge, Found
-from ringfence.world.cells import Cells
+from ringfence.world.causes import Cause, Cells, Edge, Found
 from ringfence.world.dynamics import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
 from ringfence.world.quantities import Entry, Length
@@ -289,6 +288,26 @@ def test_thresholds_may_depend_on_other_numbers():
     (cause,) = found.causes
     assert found.explained > 0.98 and cause.is_rule
     np.testing.assert_allclose(cause.reads[0].weights[1] / cause.reads[0].weights[0], 50.0, rtol=0.02)
+
+
+def test_any_of_several_thresholds_may_depend_on_a_number():
+    """Who crosses while somebody comes from the right within 2 s, and who is in sight to either side of a heading."""
+    rng = np.random.default_rng(0)
+    own, right, speed = (rng.uniform(*ends, (30_000, 1)) for ends in ((-8, 12), (-8, 12), (0, 2.5)))
+    unsafe = ((np.abs(own) < 1.6) & (right > 0) & (right < 2.0 * speed))[:, 0]
+    x = np.stack([own, right, speed], -1).astype(np.float32)
+    found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 50, ["own.gap", "right.gap", "right.speed"])
+    (cause,) = found.causes
+    assert found.explained > 0.99 and found.false_alarms < 0.001
+    (soon,) = [one for one in cause.reads[0].parts if len(one.parts) == 2]
+    np.testing.assert_allclose(soon.weights[1] / soon.weights[0], -2.0, atol=0.05)
+    bearing = rng.uniform(-2, 2, (30_000, 1))
+    unsafe = ((right > 0) & (right < 6) & (np.abs(bearing - 0.5 * speed) < 0.6))[:, 0]
+    x = np.stack([right, speed, bearing], -1).astype(np.float32)
+    found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 50, ["own.ahead", "own.rate", "own.bearing"])
+    assert found.explained > 0.97 and found.false_alarms < 0.002
+    slanted = [one for one in found.causes[0].reads[0].parts if len(one.parts) == 2]
+    assert len(slanted) == 2, "both sides"
 
 
 @pytest.mark.parametrize("what", ["three", "flat", "middle"])

@@ -234,3 +234,25 @@ def test_ope_refuses_before_it_reads_anything(flag, value, tmp_path, capsys):
 def test_seeds_that_jax_does_not_take_are_refused(seed, small_store):
     with pytest.raises(UserError, match="seed=.* must be a whole number from 0 to 2,147,483,647"):
         worlds.fit(small_store, seed=seed)
+
+
+def test_the_core_needs_neither_simulators_nor_pages_nor_films():
+    """A robot that acts installs neither MuJoCo nor matplotlib; what needs them says how to get them."""
+    script = """
+import sys
+for name in ("matplotlib", "PIL", "jinja2", "pettingzoo", "gymnasium", "mujoco", "flatbuffers"):
+    sys.modules[name] = None
+import ringfence
+from ringfence.cli import app
+from ringfence.envs import SafeMuJoCo
+for name in set(ringfence.__all__) - {"build_report"}:
+    getattr(ringfence, name)
+for use in (lambda: ringfence.build_report, lambda: SafeMuJoCo("2x4").model()):
+    try:
+        use()
+    except ringfence.UserError as error:
+        print(error)
+"""
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert "Pages, figures and films need jinja2, which is missing; run pip install 'ringfence[report]'." in said
+    assert "Robots need gymnasium, which is missing; run pip install 'ringfence[sim]'." in said

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ringfence.errors import UserError
-from ringfence.nets.mean_plan import Centre
+from ringfence.nets.team import Centre
 from ringfence.proposals import diffusion
 
 BAR = diffusion.cosine_schedule(200)

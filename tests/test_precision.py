@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import ringfence
+from ringfence.guards import proof as bounds
 from ringfence.loading import resolve
 from ringfence.logs.store import EpisodeStore
-from ringfence.nets import bounds
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.training import loop, worlds
 from ringfence.training.runs import sound_arrays
 from ringfence.utils.precision import float32

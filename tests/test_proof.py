@@ -9,12 +9,12 @@ import pytest
 from ringfence.deploy import zoo
 from ringfence.envs import Crossing
 from ringfence.errors import UserError
+from ringfence.guards import proof as bounds
 from ringfence.guards.policy import build
 from ringfence.guards.proof import Box, Prover, score_below
 from ringfence.guards.wrap import Nothing
 from ringfence.loading.resolve import load
-from ringfence.nets import bounds
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.world.barrier import Barrier
 from ringfence.world.cause_nets import CauseNet, Distance, worst
 from ringfence.world.causes import Cause, Edge

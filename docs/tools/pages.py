@@ -95,7 +95,7 @@ REFERENCE = {
         "ringfence.algos.omar",
         "ringfence.algos.fisor",
         "ringfence.algos.icbf",
-        "ringfence.algos.mpc",
+        "ringfence.algos.untrained",
     ),
     "Tasks": ("ringfence.datasets.registry", "ringfence.problem.features"),
     "Simulators": ("ringfence.envs", "ringfence.envs.pettingzoo"),

@@ -126,6 +126,18 @@ def reason(error: BaseException) -> str:
 
 
 @contextmanager
+def needs(extra: str, use: str) -> Iterator[None]:
+    """Import packages that the core goes without: one that is missing becomes a refusal that says how to get it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = str(error.name).partition(".")[0]
+        if package == __package__:
+            raise
+        raise UserError(f"{use} need {package}, which is missing; run pip install 'ringfence[{extra}]'.") from None
+
+
+@contextmanager
 def reading(
     path: str | Path, what: str, remedy: str = "copy it again", kind: type[UserError] = StoreError
 ) -> Iterator[None]:

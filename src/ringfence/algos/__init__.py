@@ -9,11 +9,10 @@ from ringfence.algos.bc import BC, BC_SAFE
 from ringfence.algos.fisor import FISOR
 from ringfence.algos.flow import FLOW
 from ringfence.algos.icbf import ICBF, MADIFF
-from ringfence.algos.mpc import MPC
-from ringfence.algos.naive import NAIVE
 from ringfence.algos.omar import MA_CQL, OMAR
 from ringfence.algos.returns import BC_BEST, BC_RETURN
 from ringfence.algos.td3bc import MA_TD3BC, MA_TD3BC_LAG
+from ringfence.algos.untrained import MPC, NAIVE
 from ringfence.errors import one_of
 from ringfence.types import Algorithm
 from ringfence.utils.config import build_config

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.logs.windows import NOT_ARRIVED
-from ringfence.nets.heads import barrier_on
+from ringfence.nets.layers import barrier_on
 from ringfence.nets.optim import Optimiser, average
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals.retention import Retention

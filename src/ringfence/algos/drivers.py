@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from ringfence.errors import UserError
 from ringfence.logs.windows import NOT_ARRIVED
-from ringfence.nets.residual import ResidualMLP
+from ringfence.nets.layers import ResidualMLP
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.drivers import driver_scores
 from ringfence.types import Array, Batch, Key, Metrics

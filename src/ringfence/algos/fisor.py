@@ -27,7 +27,7 @@ from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData
 from ringfence.nets import MLP
-from ringfence.nets.embedding import sinusoidal
+from ringfence.nets.layers import sinusoidal
 from ringfence.nets.optim import Optimiser, follow
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard

@@ -32,8 +32,8 @@ from ringfence.algos import actor_critic as ac
 from ringfence.algos import drivers
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData
+from ringfence.nets.layers import ResidualMLP
 from ringfence.nets.optim import Optimiser, fresh, stepped
-from ringfence.nets.residual import ResidualMLP
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions

@@ -2,7 +2,7 @@
 
 Losses, each with the paper's symbol:
     L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 6)
-    L^M  the mean plan that noise is diffused around                                          (nets/mean_plan.py)
+    L^M  the mean plan that noise is diffused around                                          (nets/team.py)
     L^C  the generator follows the World's barrier by λ (`split`), or as printed (algos/algorithm1.py)      (eq. 8)
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
     L^E, L^Q  who drives; a plan is of one driver                                             (algos/drivers.py)
@@ -27,16 +27,14 @@ from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData, at
 from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
-from ringfence.nets.heads import infer_action
-from ringfence.nets.mean_plan import MeanPlan
+from ringfence.nets.layers import infer_action
 from ringfence.nets.optim import Optimiser, fresh, stepped
-from ringfence.nets.team import planning_as
+from ringfence.nets.team import MeanPlan, planning_as
 from ringfence.problem import features, normalise
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions, diffusion
 from ringfence.proposals import retention as cbf
-from ringfence.proposals.generator import Generator, generator
-from ringfence.proposals.planner import Planner
+from ringfence.proposals.planner import Generator, Planner, generator
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.utils.config import BatchSize, Count, Depth, Natural, NonNegative, Positive, Rows, Share, Width
 from ringfence.world import World

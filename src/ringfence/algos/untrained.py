@@ -6,12 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.algos import actor_critic as ac
+from ringfence.datasets import registry
+from ringfence.datasets.recipes.proving import Naive
+from ringfence.envs import System
+from ringfence.errors import UserError
 from ringfence.problem import features
-from ringfence.types import Algorithm, Batch, Key, Metrics, Policy, PyTree, Spec
+from ringfence.problem.bounds import Bounds
+from ringfence.types import Algorithm, Array, Batch, Key, Metrics, Policy, PolicyStep, PyTree, Spec
 from ringfence.utils.config import BatchSize, Count, Natural, Rows
+from ringfence.world import World
 
 
 @dataclass(frozen=True)
@@ -60,3 +67,37 @@ def _make_update(config: Config, spec: Spec, feature_map: Any, hazard: Any) -> C
 
 def _cost_source(config: Config) -> Literal["nothing"]:
     return "nothing"
+
+
+def _naive(spec: Spec) -> Naive:
+    """The driver of a task, whose bodies it knows."""
+    task = registry.TASKS.get(spec.task)
+    if task is None or not isinstance(task.env, System):
+        raise UserError(f"The naive driver knows the bodies of the proving ground, not those of '{spec.task}'.")
+    return Naive(task.env)
+
+
+NAIVE = untrained("naive", _naive)
+
+
+class Rest(eqx.Module):
+    """Proposes to do nothing."""
+
+    spec: Spec = eqx.field(static=True)
+
+    def initial_state(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        s = self.spec
+        shape = (observations.shape[0], s.n_agents, s.action_dim)
+        return carry, PolicyStep(jnp.full(shape, Bounds(s.action_low, s.action_high).middle, jnp.float32), {})
+
+    def propose(
+        self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+    ) -> tuple[PyTree, Array, dict[str, Array]]:
+        shape = (observations.shape[0], 1, rows, self.spec.n_agents, self.spec.action_dim)
+        return carry, jnp.zeros(shape), {}
+
+
+MPC = untrained("mpc", Rest)

@@ -174,7 +174,7 @@ def _rollout_actions(env: PureEnv, first: PyTree, actions: Array) -> dict[str, A
 
 
 def rollout(env: PureEnv, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
-    """Arrays (B, L, ...) of the episodes that `envs.rollout.scanned` plays."""
+    """Arrays (B, L, ...) of the episodes that `envs.base.scanned` plays."""
     return logged(env, *scanned(env, first, choose, xs))
 
 

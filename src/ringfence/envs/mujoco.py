@@ -29,7 +29,7 @@ import numpy as np
 
 from ringfence.envs import film
 from ringfence.envs.base import Outcome, Seed, Seen
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, needs, unknown
 from ringfence.problem.features import VIEWS, FeatureMap, Source
 from ringfence.problem.partners import others
 from ringfence.types import Array
@@ -209,8 +209,8 @@ class SafeMuJoCo:
 
     def model(self) -> Any:
         """The MuJoCo model; the Ant's is refused on versions whose physics differs."""
-        import gymnasium
-
+        with needs("sim", "Robots"):
+            import gymnasium
         mujoco = _mujoco()
         version = tuple(int(x) for x in re.findall(r"\d+", mujoco.__version__)[:2])
         if self.ant and version >= (4, 0):
@@ -365,7 +365,8 @@ class Simulation:
 
 def _mujoco() -> Any:
     """MuJoCo, whose stubs lack what its extension defines."""
-    import mujoco
+    with needs("sim", "Robots"):
+        import mujoco
 
     return mujoco
 

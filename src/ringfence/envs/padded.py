@@ -6,15 +6,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 
 from ringfence.envs.episode import is_vector, made
-from ringfence.errors import UserError
+from ringfence.errors import UserError, needs
 from ringfence.problem.bounds import Bounds
 from ringfence.types import has_entry
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Box
 
 SPARE = (-1.0, 1.0)  # bounds of an action's entry that an agent has not; it stays at their middle
 
@@ -149,6 +151,11 @@ class Layout:
             raise UserError(f"{what} of {agent} has shape {array.shape}, the first agent's begins {first}; mend one.")
         return array
 
+def _box() -> type[Box]:
+    with needs("sim", "Spaces of padded simulators"):
+        from gymnasium.spaces import Box
+    return Box
+
 
 class PaddedEnv:
     """A PettingZoo `ParallelEnv` behind its `layout`; what is not said here is the simulator's own."""
@@ -174,13 +181,13 @@ class PaddedEnv:
             return returned
         return self._rows(returned[0]), *returned[1:]
 
-    def observation_space(self, agent: Any) -> gymnasium.spaces.Box:
-        return gymnasium.spaces.Box(-np.inf, np.inf, (len(self.layout.entries),), np.float64)
+    def observation_space(self, agent: Any) -> Box:
+        return _box()(-np.inf, np.inf, (len(self.layout.entries),), np.float64)
 
-    def action_space(self, agent: Any) -> gymnasium.spaces.Box:
+    def action_space(self, agent: Any) -> Box:
         shape = self.layout.has_entry.shape
         low, high = (np.broadcast_to(one, shape)[self.layout.agents.index(agent)] for one in self.layout.bounds)
-        return gymnasium.spaces.Box(low, high, dtype=np.float64)
+        return _box()(low, high, dtype=np.float64)
 
     def _rows(self, observations: Mapping[Any, Any]) -> Any:
         """By agent; a step that shows nobody, or not all, shows what it does."""

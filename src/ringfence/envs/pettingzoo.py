@@ -10,13 +10,15 @@ from typing import Any
 
 import jax
 import numpy as np
-from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
 from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread, SpreadAlike
-from ringfence.errors import UserError
+from ringfence.errors import UserError, needs
+
+with needs("sim", "Simulators behind PettingZoo's API"):
+    from gymnasium import spaces
+    from pettingzoo import ParallelEnv
 
 LANDMARK_RADIUS = 0.05
 FRAME_SIZE = 480  # pixels, both sides

@@ -23,7 +23,7 @@ import optax
 from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.correction import TOLERANCE, Corrector
 from ringfence.guards.options import GuardOptions
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.problem.constraints import lowest
 from ringfence.problem.features import others_offsets
 from ringfence.types import Array, Key

@@ -17,8 +17,7 @@ from ringfence.utils.precision import on_device
 from ringfence.world import World, cause_candidates
 from ringfence.world.card import UNKNOWN
 from ringfence.world.cause_counts import Explained, counted, some_steps
-from ringfence.world.causes import Cause
-from ringfence.world.cells import Cells
+from ringfence.world.causes import Cause, Cells
 from ringfence.world.judging import Judging
 from ringfence.world.logged import Logged
 from ringfence.world.quantities import Entry

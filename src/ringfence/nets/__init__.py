@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ringfence.errors import unknown
 from ringfence.nets.agent_attention import AgentAttention
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.nets.team import TeamDenoiser
 from ringfence.types import Key
 

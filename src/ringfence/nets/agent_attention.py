@@ -10,8 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ringfence.nets.embedding import Condition
-from ringfence.nets.flat import entries, flattened, restored
+from ringfence.nets.layers import Condition, entries, flattened, restored
 from ringfence.types import Array, Key
 
 HEADS = 4

@@ -6,13 +6,13 @@ one number of agents, whom it tells apart.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ringfence.nets.embedding import Condition
-from ringfence.nets.flat import entries, flattened, restored
-from ringfence.nets.residual import ResidualMLP
+from ringfence.nets.layers import Condition, ResidualMLP, entries, flattened, restored
 from ringfence.types import Array, Key
 
 CONDITION = 64  # units of the condition: diffusion step, return, driver
@@ -61,3 +61,49 @@ def planning_as(denoiser, driver: Array | None):
         return denoiser(x, k, y, keep, jnp.tile(driver, x.shape[0] // driver.shape[0]))
 
     return net
+
+
+class Centre(NamedTuple):
+    """What plans x (B, H, N, D) are diffused around: z = (x − mean) / scale."""
+
+    mean: Array  # (B, H, N, D)
+    log_scale: Array  # (H, 1, D)
+
+    def rest(self, plan: Array, mask: Array) -> Array:
+        """z of plans; known entries, of `mask` (B, H, N, 1), are left as they are."""
+        return jnp.where(mask, plan, (plan - self.mean) * jnp.exp(-self.log_scale))
+
+    def plan(self, rest: Array) -> Array:
+        """Inverse of `rest`, of what is not known."""
+        return self.mean + jnp.exp(self.log_scale) * rest
+
+    def surprise(self, plan: Array, weight: Array) -> tuple[Array, Array]:
+        """(squared error of the mean, surprise of a Gaussian of that scale about the error) of logged plans, by
+        `weight` (B, H, N or 1, D or 1). Each teaches its own part alone."""
+        error = (plan - self.mean) ** 2
+        left = jax.lax.stop_gradient(error)
+        told = 0.5 * left * jnp.exp(-2.0 * self.log_scale) + self.log_scale
+        weight = jnp.broadcast_to(weight, error.shape)
+        count = jnp.maximum(weight.sum(), 1.0)
+        return (error * weight).sum() / count, (told * weight).sum() / count
+
+
+class MeanPlan(eqx.Module):
+    """m(s, y): a denoiser that is shown no noise."""
+
+    net: Any
+    log_scale: Array  # (H, 1, D) of what is left, in standard deviations of the data's
+
+    def __call__(
+        self, plan: Array, mask: Array, y: Array, keep: Array, driver: Array | None = None, guidance: float = 1.0
+    ) -> Centre:
+        """What plans with the known entries (`mask`) of `plan` (B, H, N, D) are diffused around, given y (B,) where
+        `keep` (B,) says so, of drivers (B,); with classifier-free `guidance`."""
+        shown = jnp.where(mask, plan, 0.0)
+        k = jnp.zeros(plan.shape[0], jnp.int32)
+        net = planning_as(self.net, driver)
+        mean = net(shown, k, y, keep)
+        if guidance != 1.0:
+            free = net(shown, k, y, ~keep)
+            mean = free + guidance * (mean - free)
+        return Centre(mean, self.log_scale)

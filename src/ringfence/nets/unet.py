@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
-from ringfence.nets.embedding import sinusoidal
+from ringfence.nets.layers import sinusoidal
 from ringfence.types import Array, Key
 
 MULTIPLIERS = (1, 4, 8)  # channels of a resolution, in units of width

@@ -102,7 +102,7 @@ def _barrier_around(run: Run, state: np.ndarray | None) -> tuple[Around, Barrier
     import jax.numpy as jnp
 
     from ringfence.loading.resolve import load
-    from ringfence.nets.heads import barrier_on
+    from ringfence.nets.layers import barrier_on
     from ringfence.training import worlds
 
     if not run.checkpoints():

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.nets.optim import follow, regress
 from ringfence.problem.constraints import lowest
 from ringfence.problem.entries import Entries

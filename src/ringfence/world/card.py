@@ -48,7 +48,7 @@ class Data(Part, frozen=True):
     ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
     # of entries that nobody named, or that are read by another name, by the one they have (problem/inferred_names.py)
     inferred_names: dict[str, str] | None = None
-    impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
+    impacts: int = 0  # unsafe steps that threw a body back (world/fit.py)
     action_delay: int = 0  # steps that commands took to take effect: a guard decides for so much later (logs/late.py)
     late: tuple[int | None, ...] = ()  # steps after which commands of each agent take effect, where not at once
     agents: list[str] | None = None  # their names, in order, where these say more than numbers do

@@ -96,14 +96,13 @@ def _of_three(offset: tuple[Entry, ...]) -> Iterator[Cause]:
 def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:
     """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are."""
     own, several = _own(names), things_of(names)
-    known = set.union(*map(set, cause.entries()))
     found = _numbers("", [own])
     for kind, each in several.items():
         if kind == cause.kind and len(each) == cause.things:
             axes = axes_of(each[0])
             found += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
             found += _closing(kind, each, axes, own) if axes else ()
-    yield from (one for one in found if not known >= {d for leaf in leaves(one) for d in leaf.at})
+    yield from found
 
 
 def of_team(names: Sequence[str]) -> Iterator[Cause]:

@@ -14,8 +14,7 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from ringfence.world.causes import Cause, Edge, narrowed
-from ringfence.world.cells import CELLS, Cells
+from ringfence.world.causes import CELLS, Cause, Cells, Edge, narrowed
 from ringfence.world.quantities import Entry, Quantity, from_zero, is_condition
 
 UNSAFE_STEPS = 30_000  # that causes are looked for in, at most

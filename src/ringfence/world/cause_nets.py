@@ -18,13 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.utils.precision import on_device
-from ringfence.world.causes import Cause, Edge, Found
-from ringfence.world.cells import CELLS, Cells
+from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found
 from ringfence.world.settings import Settings
 
 BATCH = 512  # steps

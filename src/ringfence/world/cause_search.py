@@ -31,8 +31,7 @@ from ringfence.world.cause_counts import (
     some_steps,
     within,
 )
-from ringfence.world.causes import Cause, Edge, Found, narrowed, only_of, only_where
-from ringfence.world.cells import CELLS, Cells
+from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found, narrowed, only_of, only_where
 from ringfence.world.quantities import Entry, Length, Over, Quantity, leaves
 from ringfence.world.rules import rules_of, tilted_of, weighted_of
 
@@ -153,18 +152,20 @@ def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names:
 
 
 def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained) -> Counted:
-    """The cause with thresholds that depend on other numbers, or a sum over the team with weights, where these tell
+    """The cause with thresholds that depend on other numbers, or a sum over the team with weights, while these tell
     clearly more: boxes as long as both are, limits that fall along a way."""
     more = [one for one in beside(best.cause, names) if _varies(steps, one)]
-    tried = [*weighted_of(steps, best, explained), *tilted_of(steps, best, explained, more)]
-    found = [counted(steps, cause, explained) for cause in tried]
-    least = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
-    better = next((one for one in found if one.gain >= least), best)
-    gained, error = gain(steps, explained.beside(best), better.safe)
-    lost = gain(steps, explained.beside(better), best.safe)[0]
-    before, after = (_told_wrong(steps, one, explained) for one in (best, better))
-    fewer = before - after > max(SLANTED * before, NEEDLESS * steps.unsafe.sum())
-    return better if fewer and gained - lost > SURE * error else best
+    while True:
+        tried = [*weighted_of(steps, best, explained), *tilted_of(steps, best, explained, more)]
+        found = [counted(steps, cause, explained) for cause in tried]
+        least = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
+        better = next((one for one in found if one.gain >= least), best)
+        gained, error = gain(steps, explained.beside(best), better.safe)
+        lost = gain(steps, explained.beside(better), best.safe)[0]
+        before, after = (_told_wrong(steps, one, explained) for one in (best, better))
+        if before - after <= max(SLANTED * before, NEEDLESS * steps.unsafe.sum()) or gained - lost <= SURE * error:
+            return best
+        best = better
 
 
 def _told_wrong(steps: Steps, one: Counted, explained: Explained) -> int:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 import optax
 
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem import partners
 from ringfence.problem.entries import Entries

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
-from ringfence.world.causes import Cause
-from ringfence.world.cells import VISITED, Cells
-from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many
+from ringfence.world.causes import VISITED, Cause, Cells
+from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many, leaves
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
@@ -80,22 +79,24 @@ def _reading(cause: Cause, read: Quantity) -> Cause:
 
 
 def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Quantity]) -> Iterator[Cause]:
-    """The cause with one of its thresholds a line of one or a few numbers more: those that tell most of the steps."""
+    """The cause with a line of one or a few numbers more in the place of one of its thresholds: of that by which most
+    steps are told rightly."""
     conditions = _conditions(one)
     some = _read(steps, one, explained, SCREENED)[0]
-    best: tuple[float, int, _Near, np.ndarray] | None = None
-    for k in range(len(conditions) if more else 0):
+    best: tuple[int, int, _Near, list[Quantity]] | None = None
+    for k, old in enumerate(conditions):
         near = _Near.of(some, one.cause, conditions, k)
-        if min(near.bad.sum(), near.fine.sum()) >= FEW:
-            loss, weights = near.likeliest(more)
-            if best is None or loss < best[0]:
-                best = loss, k, near, weights
+        known = {d for leaf in leaves(old) for d in leaf.at}
+        free = [each for each in more if not known >= {d for leaf in leaves(each) for d in leaf.at}]
+        if free and min(near.bad.sum(), near.fine.sum()) >= FEW:
+            fewer, likely = near.likely(free)
+            if best is None or fewer > best[0]:
+                best = fewer, k, near, likely
     if best is None:
         return
-    _, k, few, weights = best
+    _, k, few, likely = best
     read = _read(steps, one, explained)[0]
     whole = _Near.of(read, one.cause, conditions, k)
-    likely = [more[j] for j in np.argsort(-np.abs(weights))[:LIKELY] if weights[j]]
     terms: list[Quantity] = []
     while likely and len(terms) < MOST_TERMS:
         losses = [few.likeliest([*terms, one])[0] for one in likely]
@@ -214,6 +215,14 @@ class _Near:
         weights = np.zeros(numbers.shape[1])
         weights[usable] = found.x[1:-1] / max(abs(found.x[0]), 1e-6) * (unit / spread[usable] if raw else 1.0)
         return float(found.fun), weights
+
+    def likely(self, quantities: Sequence[Quantity]) -> tuple[int, list[Quantity]]:
+        """(by how many steps fewer are told wrongly where the condition reads all of these, too, the likeliest)."""
+        numbers = self.of_quantities(quantities)
+        weights = self.likeliest(quantities, raw=True)[1]
+        fewer = self.best(numbers[:, :0], weights[:0])[0] - self.best(numbers, weights)[0]
+        order = np.argsort(-np.abs(weights * numbers.std(0)))[:LIKELY]
+        return fewer, [quantities[j] for j in order if weights[j]]
 
     def refined(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """Weights of numbers (M, K) by which fewest steps are told wrongly, each in turn, and where danger begins."""

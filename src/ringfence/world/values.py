@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import team_mean

@@ -12,7 +12,7 @@ import numpy as np
 
 from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.result import UNKNOWN, Mean, Values
-from ringfence.nets.mlp import MLP
+from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
