@@ -18,25 +18,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.behaviour import (
+    ACTION_STEPS,
     LEVELS,
     LINEAGES,
     POLICIES,
+    REPLAY_SHARE,
+    REPLAY_TRANSITIONS,
     TIER_NOISE,
     BehaviourPolicy,
+    BehaviourRun,
+    actions_of,
     collect,
     resimulate,
     save_behaviour,
     suffix,
-)
-from ringfence.datasets.matd3 import MATD3Config
-from ringfence.datasets.replay import (
-    ACTION_STEPS,
-    REPLAY_SHARE,
-    REPLAY_TRANSITIONS,
-    BehaviourRun,
-    actions_of,
     train_behaviour,
 )
+from ringfence.datasets.matd3 import MATD3Config
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.utils.files import whole
 

@@ -25,9 +25,9 @@ import numpy as np
 from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, BehaviourPolicy, save_behaviour
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
-from ringfence.datasets.robots import Numbers, choose, file_of
+from ringfence.datasets.recipes.robots import Numbers, choose, file_of
+from ringfence.envs.base import Memoryless, rollout, split_off
 from ringfence.envs.mujoco import Parts, SafeMuJoCo, Simulation
-from ringfence.envs.rollout import Memoryless, rollout, split_off
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key
 

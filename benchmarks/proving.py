@@ -31,7 +31,7 @@ from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS, get
 from ringfence.envs import System
 from ringfence.envs.proving.layout import PLANAR
-from ringfence.envs.proving.suite import TEST
+from ringfence.envs.proving.system import TEST
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.protocol import evaluate_policy

@@ -22,7 +22,7 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
-from ringfence.utils.natural import natural, numbered
+from ringfence.utils.text import natural, numbered
 from tests.quick import QUICK_WORLD
 
 COUNT = 12

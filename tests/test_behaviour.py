@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 
 from benchmarks.behaviour import snapshot, statistics
-from ringfence.datasets import behaviour, matd3, registry, replay
+from ringfence.datasets import behaviour, matd3, registry
 from ringfence.datasets.behaviour import (
     BehaviourPolicy,
     collect,
     load_behaviour,
+    replay_episodes,
     resimulate,
     save_behaviour,
     shipped_policy,
+    train_behaviour,
 )
 from ringfence.datasets.matd3 import MATD3Config
 from ringfence.datasets.recipes import spread
-from ringfence.datasets.replay import replay_episodes, train_behaviour
 from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.errors import UserError
 
@@ -65,10 +66,10 @@ def test_updates_move_the_critics_towards_the_reward():
     """With no future (discount 0) and enough updates, the critics' values approach the scaled rewards."""
     config = MATD3Config(hidden=32, envs=16, random_rounds=1, updates=400, batch=128, discount=0.0)
     key = jax.random.key(0)
-    learner, memory = replay._init_learner(ENV, config, key), replay._empty_memory(ENV, 16)
+    learner, memory = behaviour._init_learner(ENV, config, key), behaviour._empty_memory(ENV, 16)
     rounds = jnp.arange(1)
 
-    learner, memory, _ = replay._train_rounds(ENV, config, learner, memory, rounds, key[None])
+    learner, memory, _ = behaviour._train_rounds(ENV, config, learner, memory, rounds, key[None])
     states = jax.tree.map(lambda x: x[:, :-1].reshape(-1, *x.shape[2:]), memory.states)
     seen = ENV.observe(states)
     value = matd3.value(learner.critics, seen.reshape(len(seen), -1), memory.actions.reshape(-1, 3, 2))
@@ -80,10 +81,10 @@ def test_updates_move_the_critics_towards_the_reward():
 def test_any_number_of_agents(agents=5):
     env = SimpleSpread(n_agents=agents)
     key = jax.random.key(0)
-    learner, memory = replay._init_learner(env, TINY, key), replay._empty_memory(env, 8)
+    learner, memory = behaviour._init_learner(env, TINY, key), behaviour._empty_memory(env, 8)
     # Traced, not compiled: shapes are what may depend on the number of agents.
     traced = jax.eval_shape(
-        partial(replay._train_rounds, env, TINY), learner, memory, jnp.arange(2), jax.random.split(key, 2)
+        partial(behaviour._train_rounds, env, TINY), learner, memory, jnp.arange(2), jax.random.split(key, 2)
     )
     assert jax.tree.map(jnp.shape, traced[:2]) == jax.tree.map(jnp.shape, (learner, memory))
     data = collect(env, BehaviourPolicy(learner.actors, 0.1), 5, jax.random.key(1), batch=3)
@@ -118,7 +119,7 @@ def test_broken_files_are_refused(run, tmp_path):
     npz = behaviour.POLICIES / "simple_spread-medium-replay.npz"
     (tmp_path / "r.npz").write_bytes(npz.read_bytes()[:50_000])
     with pytest.raises(UserError, match="not a whole replay"):
-        replay._load_replay(tmp_path / "r.npz")
+        behaviour._load_replay(tmp_path / "r.npz")
 
 
 def test_bad_requests_are_refused():
@@ -187,7 +188,7 @@ def test_lineages_that_do_not_ship_are_refused():
     with pytest.raises(UserError, match="no lineage 5; the package ships 0 to 4"):
         shipped_policy("expert", lineage=5)
     with pytest.raises(UserError, match="1 to 780 episodes"):
-        replay.shipped_replay(ENV, 781, 1)
+        behaviour.shipped_replay(ENV, 781, 1)
 
 
 def test_random_tier_matches_the_public_returns():

@@ -25,7 +25,7 @@ from ringfence.report.headline import danger
 from ringfence.report.published import PUBLISHED, matches
 from ringfence.report.standings import aggregate, aggregates, contests
 from ringfence.report.table import Method
-from ringfence.utils.escape import latex, markdown, shell, spreadsheet, terminal
+from ringfence.utils.text import latex, markdown, shell, spreadsheet, terminal
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
 LOW, HIGH = 159.8, 516.8  # Simple Spread's normalisation

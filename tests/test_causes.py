@@ -16,8 +16,8 @@ from ringfence.errors import UserError
 from ringfence.guards import searched, shown
 from ringfence.problem import features
 from ringfence.problem.features import FeatureMap
-from ringfence.problem.others import others as others_of
-from ringfence.problem.turns import Turn
+from ringfence.problem.motion import Turn
+from ringfence.problem.partners import others as others_of
 from ringfence.report.ope_page import build_ope
 from ringfence.world import (
     cause_candidates,

@@ -18,7 +18,7 @@ import ringfence
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.store import EpisodeStore
-from ringfence.utils.content import content_of
+from ringfence.utils.functions import content_of
 from ringfence.utils.progress import Progress
 
 
@@ -278,7 +278,7 @@ def test_another_process_finds_the_same_content(tmp_path):
     """Whatever addresses and the order of sets are there."""
     code = """
 import functools, random, numpy as np
-from ringfence.utils.content import content_of
+from ringfence.utils.functions import content_of
 class Policy:
     names = {"a", "b", "c", "d"}
     def __init__(self): self.w, self.rng, self.me = np.ones(3), np.random.default_rng(), self

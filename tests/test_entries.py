@@ -9,9 +9,8 @@ from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
 from ringfence.guards.shown import _going
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.problem.entries import Entries, Entry, axes_of
+from ringfence.problem.entries import Entries, Entry, Names, axes_of
 from ringfence.problem.features import FeatureMap, constant_velocity, derived, from_data, headed, others_offsets
-from ringfence.problem.names import Names
 from ringfence.world import cause_candidates
 from ringfence.world.barrier import shape_of
 from ringfence.world.dynamics import Heading

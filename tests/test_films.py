@@ -15,7 +15,7 @@ from ringfence import collect, play
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.problem import constraints
-from ringfence.problem.names import Names
+from ringfence.problem.entries import Names
 from ringfence.report import build_report
 from ringfence.report.video import recorded
 from ringfence.training import loop

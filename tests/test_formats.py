@@ -16,7 +16,7 @@ from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import read_columns
 from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.io.observe import observe
-from ringfence.logs.io.units import utm, zone_of
+from ringfence.logs.io.rows import utm, zone_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation
 from tests.test_tables import NAMES, entry, fleet

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ringfence.envs.proving.suite import DEVELOPMENT, TEST
+from ringfence.envs.proving.system import DEVELOPMENT, TEST
 from ringfence.problem import on_map
 from ringfence.problem.entries import loosely
 from ringfence.problem.inferred_names import inferred_names
-from ringfence.problem.others import others as others_of
+from ringfence.problem.partners import others as others_of
 from ringfence.training import worlds
 from ringfence.world.card import Card, Data, HeldOut, summary
 from tests.quick import QUICK_WORLD

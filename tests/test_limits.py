@@ -145,7 +145,7 @@ def test_scarce_danger_is_said_and_not_calibrated(unsafe):
 
 
 def test_usual_numbers_have_no_exponent():
-    from ringfence.utils.numbers import percent, significant
+    from ringfence.utils.text import percent, significant
 
     assert [percent(1.0), percent(0.9999), percent(0.0), percent(0.00123)] == ["100 %", "100 %", "0 %", "0.12 %"]
     assert [significant(1500.0), significant(1234.5, 3)] == ["1500", "1230"]

@@ -9,7 +9,7 @@ import pytest
 from ringfence.evaluation.replay.scene import names_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import features
-from ringfence.problem.others import others as others_of
+from ringfence.problem.partners import others as others_of
 from ringfence.training import worlds
 from tests.quick import QUICK_WORLD
 

@@ -12,7 +12,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import FeatureMap, from_data, from_dict, to_dict
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 from ringfence.training import worlds
 from tests.quick import QUICK_WORLD
 

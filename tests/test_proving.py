@@ -12,8 +12,8 @@ from ringfence.datasets.make import make
 from ringfence.datasets.recipes.proving import Naive
 from ringfence.envs.base import Filmed, Measured
 from ringfence.envs.film import RED
-from ringfence.envs.proving import System, drivers, observations
-from ringfence.envs.proving.suite import DEVELOPMENT, TEST
+from ringfence.envs.proving import System, drivers, layout
+from ringfence.envs.proving.system import DEVELOPMENT, TEST
 from ringfence.errors import UserError
 from ringfence.evaluation.protocol import unsafe_starts
 from ringfence.loading import oracle
@@ -91,7 +91,7 @@ def test_motion_is_read_back_from_what_is_observed():
     for name in ("hall", "street", "drones", "arms"):
         system = SYSTEMS[name]
         _, states, _ = random_steps(system)
-        motion, ahead = in_one_program(lambda x, system=system: observations.read(system, system.observe(x)), states)
+        motion, ahead = in_one_program(lambda x, system=system: layout.read(system, system.observe(x)), states)
         np.testing.assert_allclose(motion.rate, states.rate, atol=1e-5)
         turned = np.cos(np.asarray(motion.pose) - np.asarray(states.pose))
         np.testing.assert_allclose(turned, np.ones_like(turned), atol=1e-5)

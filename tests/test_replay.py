@@ -25,7 +25,7 @@ from ringfence.faults import Faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
 from ringfence.logs.store import EpisodeStore
-from ringfence.problem.names import Names
+from ringfence.problem.entries import Names
 from ringfence.report import replay_page
 from ringfence.world import save
 from ringfence.world.card import Verdict

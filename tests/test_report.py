@@ -420,12 +420,12 @@ def test_a_page_embeds_films_of_its_runs_alone(kind, runs, tmp_path):
 
 def test_names_of_strangers_are_letters_in_every_language():
     """What Markdown strikes through or escapes, and what the end of LaTeX's row before would read as its own."""
-    from ringfence.utils import escape
+    from ringfence.utils import text
 
-    assert escape.markdown("~~a~~ \\| $x$") == r"\~\~a\~\~ \\\| \$x\$"
-    assert escape.latex("[2cm]*<|>") == r"{[}2cm{]}{*}\textless{}\textbar{}\textgreater{}"
-    assert escape.page("a\x00\x1b[31m\u202e\ud800\n\tb") == "a\\x00\\x1b[31m\\u202e\\ud800\n\tb"
-    assert str(escape.lines("a\x1b]0;x\x07\n[red]b")) == "a\\x1b]0;x\\x07\n[red]b"
+    assert text.markdown("~~a~~ \\| $x$") == r"\~\~a\~\~ \\\| \$x\$"
+    assert text.latex("[2cm]*<|>") == r"{[}2cm{]}{*}\textless{}\textbar{}\textgreater{}"
+    assert text.page("a\x00\x1b[31m\u202e\ud800\n\tb") == "a\\x00\\x1b[31m\\u202e\\ud800\n\tb"
+    assert str(text.lines("a\x1b]0;x\x07\n[red]b")) == "a\\x1b]0;x\\x07\n[red]b"
 
 
 def test_a_page_holds_no_control_characters(runs, tmp_path):

@@ -17,9 +17,10 @@ import pytest
 import ringfence.envs.mujoco as simulator
 from benchmarks import behaviour_robots as makers
 from ringfence.bench import unpack
-from ringfence.datasets import matd3, registry, robots
+from ringfence.datasets import matd3, registry
 from ringfence.datasets.make import make
 from ringfence.datasets.matd3 import MATD3Config
+from ringfence.datasets.recipes import robots
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.evaluation import protocol, rollout
@@ -82,7 +83,7 @@ def test_plans_agree_on_the_body(parts):
 def test_collected_episodes_are_whole_and_replay():
     """Twice the same; every row is a step of the simulator from the row's state."""
     env = SafeMuJoCo("2x4", episode_length=60)
-    first, again = (robots.collect(env, [None, None], 300, seed=7, batch=4) for _ in range(2))
+    first, again = (robots.played(env, [None, None], 300, seed=7, batch=4) for _ in range(2))
     for name, x in first.items():
         np.testing.assert_array_equal(x, again[name])
     lengths = np.diff(first["episode_ends"], prepend=0)
@@ -271,7 +272,7 @@ def test_another_limit_counts_anew_what_is_kept(tmp_path, monkeypatch):
     native, quantile = (replace(t, env=replace(t.env, episode_length=60)) for t in map(registry.get, names))
     make(native, 300)
     with monkeypatch.context() as m:
-        m.setattr(robots, "collect", lambda *_: pytest.fail("it was simulated again"))
+        m.setattr(robots, "played", lambda *_: pytest.fail("it was simulated again"))
         counted, path = make(quantile, 300)
     simulated, _ = make(quantile, 300, fresh=True)
     for name in (*ARRAYS, "state", "speed"):

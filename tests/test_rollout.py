@@ -6,8 +6,7 @@ import jax
 import numpy as np
 
 from ringfence.envs import SimpleSpread
-from ringfence.envs.base import Outcome, Seen
-from ringfence.envs.rollout import Memoryless, nobody, rollout, scanned, split_off
+from ringfence.envs.base import Memoryless, Outcome, Seen, nobody, rollout, scanned, split_off
 from ringfence.types import PolicyStep
 
 

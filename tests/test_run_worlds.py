@@ -16,7 +16,7 @@ from ringfence.datasets.make import make
 from ringfence.errors import NoWorld, UserError
 from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
-from ringfence.logs.provenance import other_data
+from ringfence.logs.schema import other_data
 from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 from ringfence.world import load as load_world

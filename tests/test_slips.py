@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from ringfence.datasets import registry
-from ringfence.datasets.audit import audit, odd_danger
+from ringfence.datasets.audit import audit, odd_danger, slips
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation, to_dict
-from ringfence.problem.slips import slips
 from ringfence.training import worlds
 
 NAMES = ["own.x", "own.y", "goal.dx", "goal.dy", "other0.dx", "other0.dy", "other1.dx", "other1.dy"]

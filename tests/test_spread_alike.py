@@ -9,8 +9,7 @@ from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.envs import SimpleSpread, SpreadAlike
 from ringfence.envs.pettingzoo import SpreadAlikeParallel
-from ringfence.envs.simple_spread import SpreadState
-from ringfence.envs.spread_alike import SIGHT
+from ringfence.envs.simple_spread import SIGHT, SpreadState
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.play import play

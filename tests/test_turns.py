@@ -9,9 +9,9 @@ import pytest
 
 from ringfence import EpisodeStore
 from ringfence.errors import UserError
-from ringfence.problem import features, partners, turns
+from ringfence.problem import features, motion, partners
 from ringfence.problem.inferred_names import inferred_names
-from ringfence.problem.turns import Turn
+from ringfence.problem.motion import Turn
 from ringfence.training import worlds
 from ringfence.world import model
 from ringfence.world.dynamics import fit_dynamics
@@ -35,7 +35,7 @@ def steps_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("low", "whole"), [(-np.pi, WHOLE), (0.0, WHOLE), (-180.0, 360.0), (0.0, 360.0)])
 def test_an_angle_is_found_from_wherever_it_goes(low, whole):
-    (found,) = turns.found_in(*steps_of(headings(np.random.default_rng(0), low, whole)))
+    (found,) = motion.turns_in(*steps_of(headings(np.random.default_rng(0), low, whole)))
     assert found == Turn(0, pytest.approx(low), pytest.approx(whole))
 
 
@@ -46,16 +46,16 @@ def test_what_only_looks_like_an_angle_is_none():
     half = np.mod(headings(rng), np.pi)
     listed = np.sort(rng.uniform(-np.pi, np.pi, (20, 80, 3)), -1)
     for x in (drawn, swings, half, listed):
-        assert turns.found_in(*steps_of(x)) == ()
+        assert motion.turns_in(*steps_of(x)) == ()
 
 
 def test_the_shorter_way_round():
     angle = (Turn(1, -np.pi, WHOLE),)
     one, two = np.array([5.0, 3.1]), np.array([4.0, -3.1])
-    np.testing.assert_allclose(turns.apart(angle, two, one), [-1.0, WHOLE - 6.2])
-    np.testing.assert_allclose(turns.apart(angle, jnp.array(two), jnp.array(one)), [-1.0, WHOLE - 6.2], rtol=1e-5)
-    np.testing.assert_allclose(turns.within(angle, jnp.array([9.0, 3.1 + 0.2])), [9.0, 3.3 - WHOLE], rtol=1e-5)
-    ends = [turns.pointing(angle, jnp.array([5.0, a]), jnp.array([0.5, a])) for a in (-np.pi, np.pi)]
+    np.testing.assert_allclose(motion.apart(angle, two, one), [-1.0, WHOLE - 6.2])
+    np.testing.assert_allclose(motion.apart(angle, jnp.array(two), jnp.array(one)), [-1.0, WHOLE - 6.2], rtol=1e-5)
+    np.testing.assert_allclose(motion.within(angle, jnp.array([9.0, 3.1 + 0.2])), [9.0, 3.3 - WHOLE], rtol=1e-5)
+    ends = [motion.pointing(angle, jnp.array([5.0, a]), jnp.array([0.5, a])) for a in (-np.pi, np.pi)]
     np.testing.assert_allclose(*ends, atol=1e-5)
     assert ends[0].shape == (3,)
 
@@ -64,7 +64,7 @@ def test_a_world_predicts_past_the_end_of_a_turn():
     """Read as a number, the angle is predicted to go on where no angle is, and to be half a turn off beside its end."""
     rng = np.random.default_rng(2)
     angle = headings(rng)
-    rate = turns.apart((Turn(0, -np.pi, WHOLE),), angle[:, 1:, :, None], angle[:, :-1, :, None])[..., 0]
+    rate = motion.apart((Turn(0, -np.pi, WHOLE),), angle[:, 1:, :, None], angle[:, :-1, :, None])[..., 0]
     seen = np.stack([angle[:, 1:], rate], -1).astype(np.float32)  # (E, L, N, 2)
     store = EpisodeStore.from_episodes(
         seen, np.zeros((20, 78, 3, 1)), np.zeros((20, 78)), None, card={"observation_names": ["own.yaw", "own.rate"]}

@@ -35,7 +35,6 @@ REFERENCE = {
     "Logs": (
         "ringfence.logs.store",
         "ringfence.logs.late",
-        "ringfence.problem.layout",
         "ringfence.datasets.make",
         "ringfence.datasets.audit",
     ),
@@ -59,7 +58,7 @@ REFERENCE = {
         "ringfence.evaluation.protocol",
         "ringfence.evaluation.play",
         "ringfence.evaluation.stress",
-        "ringfence.faults.faults",
+        "ringfence.faults",
         "ringfence.evaluation.certify",
         "ringfence.evaluation.certificate",
         "ringfence.evaluation.monitor",

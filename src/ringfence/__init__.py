@@ -26,7 +26,7 @@ _WHERE = {
     "collect": "ringfence.logs.collect",
     "undelay": "ringfence.logs.late",
     "padded": "ringfence.envs.padded",
-    "Layout": "ringfence.problem.layout",
+    "Layout": "ringfence.envs.padded",
     "ope": "ringfence.evaluation.ope",
     "replay": "ringfence.evaluation.replay",
     "World": "ringfence.world",

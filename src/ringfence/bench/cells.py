@@ -28,15 +28,15 @@ from ringfence.bench.stressed import Trial
 from ringfence.bench.suites import COLLECTIONS, SUITES
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
+from ringfence.datasets.recipes import RECIPES
 from ringfence.datasets.task import Task
-from ringfence.datasets.version import RECIPES
 from ringfence.errors import RunConflict, UserError, one_of, unknown, whole_number
 from ringfence.evaluation import protocol, reference
 from ringfence.evaluation.evaluate import evaluate_spec
 from ringfence.guards import GuardOptions, options_of
 from ringfence.loading import oracle
 from ringfence.loading.spec import PolicySpec
-from ringfence.logs.provenance import other_data
+from ringfence.logs.schema import other_data
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults

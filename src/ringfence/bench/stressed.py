@@ -15,7 +15,7 @@ from ringfence.evaluation.protocol import PROTOCOL
 from ringfence.faults import Faults
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run
-from ringfence.utils import csvs
+from ringfence.utils import text
 
 COLUMNS = (
     "task, algorithm, seed, faults, guard, barrier, compensated, agents, episodes, return_mean, return_norm, "
@@ -101,4 +101,4 @@ def write_csv(out: str | Path, certificate: Certificate | None = None) -> Path |
     if not found:
         return None
     columns = COLUMNS if certificate is None else [*COLUMNS, COVERS]
-    return csvs.write_csv(Path(out) / "stress.csv", columns, found)
+    return text.write_csv(Path(out) / "stress.csv", columns, found)

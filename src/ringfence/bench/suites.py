@@ -8,7 +8,7 @@ from ringfence import algos
 from ringfence.bench.stressed import Trial
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
-from ringfence.envs.proving.suite import TEST
+from ringfence.envs.proving.system import TEST
 from ringfence.evaluation.compensation import known_to_guards
 from ringfence.faults import Faults
 from ringfence.loading.spec import PolicySpec

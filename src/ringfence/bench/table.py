@@ -15,7 +15,7 @@ from ringfence.bench.cells import read_about
 from ringfence.errors import UserError
 from ringfence.evaluation.table import Row, check, of_references, of_run
 from ringfence.training.runs import Run
-from ringfence.utils import csvs
+from ringfence.utils import text
 
 COLUMNS = (
     "task, algorithm, variant, guard, barrier, execution, agents, seed, episodes, return_mean, return_std, "
@@ -104,4 +104,4 @@ def _check_once(rows: Iterable[Row]) -> None:
 
 def write_csv(out: str | Path) -> Path:
     """DIR/table.csv, one line per row of `rows`."""
-    return csvs.write_csv(Path(out) / "table.csv", COLUMNS, rows(out))
+    return text.write_csv(Path(out) / "table.csv", COLUMNS, rows(out))

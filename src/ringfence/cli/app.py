@@ -23,8 +23,8 @@ from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignmen
 from ringfence.cli.replaying import AS_LOGGED, Replayed
 from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
-from ringfence.utils.escape import lines, terminal
 from ringfence.utils.files import writable
+from ringfence.utils.text import lines, terminal
 
 if TYPE_CHECKING:
     from ringfence.logs.store import EpisodeStore

@@ -14,7 +14,7 @@ from rich.table import Column, Table
 
 from ringfence.cli.console import complain, console
 from ringfence.errors import UserError, one_of
-from ringfence.utils.escape import terminal
+from ringfence.utils.text import terminal
 
 if TYPE_CHECKING:
     from ringfence.bench import Grid

@@ -14,8 +14,8 @@ from rich.markup import escape
 from ringfence.cli.console import console
 from ringfence.errors import UserError, plain
 from ringfence.logs.io.table_options import Columns, EpisodeRules, Written
-from ringfence.utils.escape import terminal
 from ringfence.utils.files import writable
+from ringfence.utils.text import terminal
 
 out = console()
 Positional = tyro.conf.Positional

@@ -15,8 +15,8 @@ out = console()
 
 def doctor() -> None:
     """Versions, devices, what is missing and how to get it."""
-    from ringfence.utils.cache import cache_dir
     from ringfence.utils.environment import environment
+    from ringfence.utils.files import cache_dir
 
     versions = environment()
     for name in ("ringfence", "python", "system", "processor", "cores", "git"):

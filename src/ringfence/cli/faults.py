@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ringfence.faults.faults import Chance, Faults
+from ringfence.faults import Chance, Faults
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import tyro
 
 from ringfence.cli.console import console
 from ringfence.errors import whole_number
-from ringfence.utils.escape import lines
+from ringfence.utils.text import lines
 
 out = console()
 Positional = tyro.conf.Positional

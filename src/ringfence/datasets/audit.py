@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+import itertools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +18,15 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import local_features
-from ringfence.problem.slips import slips
 from ringfence.types import has_entry
 
 Formula = tuple[FeatureMap, constraints.BoundHazard]
 DISAGREE = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
+NEAR = 0.75  # how alike two names are, of difflib's ratio: `othr0` and `other0` 0.91, `goal` and `own` 0.29
+LONGEST = 60  # letters of a name that are
+MOST = 200  # names that are compared: each with each
+DIGITS = "0123456789"
+TWINS = {"x": "y", "y": "x"}  # the last letter of what is told along each axis
 
 
 class Audit(NamedTuple):
@@ -276,3 +283,30 @@ def _disagreement(store: EpisodeStore, task: Task, formula: Formula) -> float:
     episode = np.searchsorted(store.episode_ends, steps, side="right")
     labels = _labels(store, task, formula, steps + episode + 1)
     return float((labels != (store.team_costs[steps] > 0)).mean())
+
+
+def slips(names: Iterable[str]) -> list[str]:
+    """A sentence for each pair of names that a letter or two keep apart, and that would leave an entry without the
+    place that its name gives it. A name is `body.what`, and bodies tell alike things: who has a `dx` has a `dy`, and
+    `other1` has what `other0` has."""
+    bodies: dict[str, set[str]] = {}
+    for name in itertools.islice(names, MOST):
+        body, dot, what = name.partition(".")
+        if dot:
+            bodies.setdefault(body, set()).add(what)
+    of_one_kind, of_others = [], []
+    for one, other in itertools.combinations(bodies, 2):
+        kind, left, others = one.rstrip(DIGITS), bodies[one] - bodies[other], bodies[other] - bodies[one]
+        if kind == other.rstrip(DIGITS) != one:  # `other0.ddx` and `other1.dx`
+            of_one_kind += [(f"{one}.{a}", f"{other}.{b}") for a in sorted(left) for b in others if _near(a, b)]
+        elif kind != other.rstrip(DIGITS) and _near(one, other):  # `othr0.dx` and `other0.dy`
+            twins = ((what, what[:-1] + TWINS.get(what[-1:], "")) for what in sorted(left))
+            of_others += [(f"{one}.{what}", f"{other}.{twin}") for what, twin in twins if twin in others]
+    return [
+        f"'{one}' and '{other}' look like one kind of entry, spelt in two ways; name them alike."
+        for one, other in of_others + of_one_kind
+    ]
+
+
+def _near(one: str, other: str) -> bool:
+    return difflib.SequenceMatcher(None, one[:LONGEST], other[:LONGEST]).ratio() >= NEAR

@@ -52,16 +52,11 @@ def import_omar(
         raise StoreError(
             f"'{directories[0]}' holds {n} agents, the task '{task}' has {known}; pass another name as task."
         )
-    stores = _seeds(directories, hazard or constraints.Separation(), task, episode_length)
-    return stores[0] if single else _pooled(directories, stores)
-
-
-def _seeds(directories: list[Path], hazard: constraints.Hazard, task: str, episode_length: int) -> list[EpisodeStore]:
-    """A store of each directory."""
-    seeds = [omar.read_seed(d, hazard, episode_length) for d in directories]
+    seeds = [omar.read_seed(d, hazard or constraints.Separation(), episode_length) for d in directories]
     if len(seeds) > 1:
         omar.check_constants(directories, seeds)
-    return [EpisodeStore.from_steps(**{**seed, "card": {"task": task, **seed["card"]}}) for seed in seeds]
+    stores = [EpisodeStore.from_steps(**{**seed, "card": {"task": task, **seed["card"]}}) for seed in seeds]
+    return stores[0] if single else _pooled(directories, stores)
 
 
 def _pooled(directories: list[Path], stores: list[EpisodeStore]) -> EpisodeStore:

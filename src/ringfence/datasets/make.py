@@ -7,15 +7,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from ringfence.datasets.recipes import RECIPES
 from ringfence.datasets.registry import siblings
 from ringfence.datasets.task import Card, Recipe, Task
-from ringfence.datasets.version import RECIPES
 from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.utils.cache import cache_dir
 from ringfence.utils.compilation import keep_programs
-from ringfence.utils.files import writable
+from ringfence.utils.files import cache_dir, writable
 from ringfence.utils.precision import in_float32
 
 SIMULATED_BY = ("simulator", "episode_length", "integrator", "reward")  # of the card: who else simulated other steps

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict
 
-from ringfence.datasets.recipes import crossing, proving, robots, spread, spread_alike
+from ringfence.datasets.recipes import crossing, proving, robots, spread
 from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike, System
 from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.envs.crossing import Body
 from ringfence.envs.mujoco import COST_LIMIT, Parts
-from ringfence.envs.proving.suite import DEVELOPMENT, TEST
+from ringfence.envs.proving.system import DEVELOPMENT, TEST
 from ringfence.errors import StoreError, UserError, one_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
@@ -53,7 +53,7 @@ def _spread_alike(tier: str) -> Task:
         _SPREAD_HAZARD,
         tier=tier,
         transitions=333_350,
-        recipe=spread_alike.RECIPE,
+        recipe=spread.ALIKE,
         homogeneous=True,
         **_SPREAD,
     )

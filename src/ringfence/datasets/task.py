@@ -23,14 +23,6 @@ def whole_episodes(task: Task, transitions: int) -> int:
     return -(-transitions // length) * length
 
 
-def _no_references(task: Task) -> dict[str, Policy]:
-    return {}
-
-
-def _not_relabelled(task: Task, store: EpisodeStore) -> tuple[np.ndarray, Card] | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Recipe:
     """How a task's data sets are regenerated: plain functions."""
@@ -42,10 +34,10 @@ class Recipe:
     # (task, transitions) -> the size that is made where so many steps are asked for
     whole: Callable[[Task, int], int] = whole_episodes
     # task -> policies for rows beside the table: who collected the data, if that was one, and what is known to be good
-    references: Callable[[Task], dict[str, Policy]] = _no_references
+    references: Callable[[Task], dict[str, Policy]] = lambda task: {}
     # (task, store) -> costs (T,) of kept steps under this task's danger and what the card says then; None where the
     # steps do not tell, or there is one definition of danger
-    relabelled: Callable[[Task, EpisodeStore], tuple[np.ndarray, Card] | None] = _not_relabelled
+    relabelled: Callable[[Task, EpisodeStore], tuple[np.ndarray, Card] | None] = lambda task, store: None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.proving import System
-from ringfence.envs.simple_spread import SimpleSpread, SpreadState
-from ringfence.envs.spread_alike import SpreadAlike
+from ringfence.envs.simple_spread import SimpleSpread, SpreadAlike, SpreadState
 
 __all__ = ["Crossing", "SafeMuJoCo", "SimpleSpread", "SpreadAlike", "SpreadState", "System"]

@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs import discs
+from ringfence.envs import film
 from ringfence.envs.base import Defaults
-from ringfence.envs.sight import approaches
 from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap, decentralized
+from ringfence.problem.partners import approaches, seen_first
 from ringfence.types import Array, Key, Transition
 
 if TYPE_CHECKING:
@@ -143,8 +143,8 @@ class Crossing(Defaults):
         return decentralized(view, self.observation_names, DT)
 
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
-        """Pictures of an episode (discs.py)."""
-        return discs.frames(self, states, moments)
+        """Pictures of an episode (film.py)."""
+        return film.disc_frames(self, states, moments)
 
     def reset(self, key: Key, batch: int) -> CrossingState:
         """At rest, each in a cell of a grid of its own, so that nobody touches anything and everybody can stay away;
@@ -225,28 +225,13 @@ class Crossing(Defaults):
         if self.body == "unicycle":
             parts.append(_ahead(state.heading))
         parts.append(state.goal - state.position)
-        parts.append(self._others_seen(state))
+        offset, speed, squared = approaches(state.position, state.velocity, SIGHT, SOON)
+        parts.append(seen_first(squared, self.neighbours, self.n_agents - 1, SIGHT, offset, speed))
         if self.obstacles:
             parts.append(self._obstacles_seen(state))
         if self.walls:
             parts.append(self._walls_seen(state))
         return jnp.concatenate(parts, -1)
-
-    def _others_seen(self, state: CrossingState) -> Array:
-        """(B, N, 5 neighbours)"""
-        lead = state.position.shape[:-1]
-        count = min(self.neighbours, self.n_agents - 1)
-        if count:
-            offset, speed = self.nearest(state)
-            seen = (offset**2).sum(-1, keepdims=True) < SIGHT**2
-            rows = jnp.concatenate([offset, speed, jnp.ones_like(offset[..., :1])], -1)
-            rows = jnp.where(seen, rows, jnp.asarray(_UNSEEN))
-        else:
-            rows = jnp.zeros((*lead, 0, 5))
-        if count < self.neighbours:
-            missing = jnp.broadcast_to(jnp.asarray(_UNSEEN), (*lead, self.neighbours - count, 5))
-            rows = jnp.concatenate([rows, missing], -2)
-        return rows.reshape(*lead, -1)
 
     def _obstacles_seen(self, state: CrossingState) -> Array:
         """(B, N, 3) or (B, N, 6): of the nearest one or two."""
@@ -313,7 +298,6 @@ class Crossing(Defaults):
         return goal, _mixed(number[..., 0] + jnp.uint32(77)).astype(jnp.float32)
 
 
-_UNSEEN = np.array([SIGHT, 0.0, 0.0, 0.0, 0.0], np.float32)
 
 
 def length(x: Array) -> Array:

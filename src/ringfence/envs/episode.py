@@ -1,19 +1,23 @@
-"""One episode in anybody's simulator, through PettingZoo's parallel API; everything that it returns is checked."""
+"""Episodes in anybody's simulators, through PettingZoo's parallel API; everything that these return is checked.
+
+Simulators side by side are one `Env` (envs/base.py)."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ringfence.errors import UserError
+from ringfence.envs.base import Outcome, Seen
+from ringfence.errors import UserError, of_kind
 from ringfence.problem.origins import NOWHERE, Origins
 from ringfence.utils.given import NUMBERS, given_as, refuse_other_order
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
+Charge = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 ByAgent = Mapping[Any, Any]
 LARGEST = 1e30  # of rewards and costs: squares of their sums are numbers still
 EARLY_ENDS = ("refuse", "cut", "skip")  # what becomes of an episode that one agent leaves before the others
@@ -84,7 +88,11 @@ class Episode:
         self.shape = shape
         self.agents = list(env.possible_agents)
         self.max_steps = max_steps
-        self._check_agents()
+        if not self.agents:
+            raise UserError(f"{self.name} has no possible_agents; give at least one.")
+        if len(set(map(str, self.agents))) < len(self.agents):
+            raise UserError(f"{self.name} names an agent twice in possible_agents; give each its own name.")
+        refuse_other_order(self.agents, self.shape.names, all_known=False)
         self._read_state: Callable[[], Any] | None = getattr(env, "state", None) if shape.state != 0 else None
         if shape.state != 0 and self._read_state is None:
             self._refuse_without_state()
@@ -106,14 +114,6 @@ class Episode:
             )
         self._check_count(begun[0])
         self._observe(begun[0])
-
-    def _check_agents(self) -> None:
-        count = len(self.agents)
-        if not count:
-            raise UserError(f"{self.name} has no possible_agents; give at least one.")
-        if len(set(map(str, self.agents))) < count:
-            raise UserError(f"{self.name} names an agent twice in possible_agents; give each its own name.")
-        refuse_other_order(self.agents, self.shape.names, all_known=False)
 
     def _check_count(self, observations: ByAgent) -> None:
         """Refuse another number of agents; where they see something else, too, that is said first."""
@@ -158,11 +158,14 @@ class Episode:
         own = [np.array(one) for one in action]  # a simulator may write into what it is given
         step = _checked(self.name, self.env.step(dict(zip(self.agents, own))))
         number = len(self.rewards) + 1
-        left = self._left(step)
+        # the first agent that ended, or is not there any more, while others go on; None where they stay together
+        gone = [a for a in self.agents if a not in step.rewards or self._agent_ended(step, a)]
+        together = len(gone) == len(self.agents) or not any([self._agent_ended(step, a) for a in gone])
+        left = None if together else gone[0]
         if left is not None and self._is_over_without(left, step, number):
             return
         self._check_all_in("rewards", step.rewards, number)
-        ended = left is not None or self._ended(step)
+        ended = left is not None or all(self._agent_ended(step, agent) for agent in self.agents)
         self.rewards.append(np.array([_number(step.rewards[a], "reward", self.name) for a in self.agents]))
         self._take_cost(step, cost)
         if number >= self.max_steps and not ended:
@@ -184,16 +187,6 @@ class Episode:
             raise UserError(
                 "step() tells neither a cost nor the state that an episode ends in; return the last observations."
             )
-
-    def _ended(self, step: Step) -> bool:
-        return all(_is_set(step.terminations, a) or _is_set(step.truncations, a) for a in self.agents)
-
-    def _left(self, step: Step) -> Any:
-        """The first agent that ended, or is not there any more, while others go on; None where they stay together."""
-        going = [a for a in self.agents if a in step.rewards and not self._agent_ended(step, a)]
-        gone = [a for a in self.agents if a not in going]
-        ended = [a for a in gone if self._agent_ended(step, a)]
-        return gone[0] if going and ended else None
 
     def _agent_ended(self, step: Step, agent: Any) -> bool:
         return _is_set(step.terminations, agent) or _is_set(step.truncations, agent)
@@ -367,3 +360,65 @@ def _number(value: Any, what: str, whose: str) -> float:
         return float(array.reshape(()))
     except (TypeError, ValueError):
         raise UserError(f"{whose} tells the {what} {str(value)[:80]!r}, which is no number; give one.") from None
+
+@dataclass(eq=False)
+class SideBySide:
+    """PettingZoo `ParallelEnv`s, whose `episodes` keep what came of each.
+
+    A step's cost is `cost(infos)` if that is given, else what the simulator tells; else `charge` of the observations
+    and states that it leads to, (B,). Where that is None, too, it is refused.
+    """
+
+    envs: Sequence[Any]
+    shape: Shape
+    max_steps: int
+    early_ends: str = "refuse"
+    cost: Cost | None = None
+    charge: Charge | None = None
+    episodes: list[Episode] = field(default_factory=list)
+
+    def __post_init__(self):
+        of_kind("cost", self.cost, Callable | None, "give a function of the infos of a step")
+
+    @property
+    def running(self) -> np.ndarray:
+        return np.array([e.running for e in self.episodes])
+
+    def reset(self, seeds: Sequence[int]) -> None:
+        """Begin as many episodes as there are seeds, in the first simulators."""
+        begun = zip(self.envs, seeds)
+        self.episodes = [Episode(env, self.shape, seed, self.max_steps, self.early_ends) for env, seed in begun]
+
+    def observe(self) -> Seen:
+        states = [e.state for e in self.episodes if e.state is not None]
+        return Seen(np.stack([e.seen for e in self.episodes]), np.stack(states) if states else None)
+
+    def step(self, action: np.ndarray) -> Outcome:
+        running = self.running
+        for episode, own in zip(self.episodes, action):
+            if episode.running:
+                episode.step(own, self.cost)
+        if any(e.lacks_cost for e in self.episodes if not e.skipped):
+            if self.charge is None:
+                raise UserError(
+                    "step() tells no cost, and no formula says of what the policy sees whether it is unsafe; pass "
+                    "cost=, a function of the agents' infos."
+                )
+            for episode, cost in zip(self.episodes, self.charge(*self.observe())):
+                episode.charge(float(cost))
+        nothing = np.zeros(action.shape[1])  # of an episode that was skipped at its first step
+        return Outcome(
+            reward=np.stack([e.rewards[-1] if e.rewards else nothing for e in self.episodes]),
+            cost=self._last_costs(),
+            terminated=running & np.array([e.terminated for e in self.episodes]),
+            shown=running & np.array([e.running or e.showed_end for e in self.episodes]),
+        )
+
+    def _last_costs(self) -> np.ndarray | dict[str, np.ndarray]:
+        """(B,) what the last step of each cost, or that by constraint."""
+        named = [e.constraints[0] for e in self.episodes if e.constraints]
+        if not named:
+            return np.array([np.max(e.costs[-1]) if e.costs else 0.0 for e in self.episodes], np.float32)
+        nothing = dict.fromkeys(named[0], 0.0)
+        last = [e.constraints[-1] if e.constraints else nothing for e in self.episodes]
+        return {name: np.array([np.max(costs[name]) for costs in last], np.float32) for name in nothing}

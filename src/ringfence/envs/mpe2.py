@@ -48,7 +48,9 @@ class Spread(_Parallel):
             five[agent] = np.array([0, max(-x, 0), max(x, 0), max(-y, 0), max(y, 0)], np.float32)
         seen, reward, terminated, truncated, infos = self.theirs.step(five)
         self.agents = list(self.theirs.agents)
-        cost = float(self._touching())
+        place = np.stack([agent.state.p_pos for agent in self.theirs.unwrapped.world.agents])
+        gap = np.linalg.norm(place[:, None] - place, axis=-1) + 9.0 * np.eye(len(place))
+        cost = float((gap < CONTACT_DISTANCE).any())
         return seen, reward, terminated, truncated, {a: {"cost": cost} for a in infos}
 
     def state(self) -> np.ndarray:
@@ -57,8 +59,3 @@ class Spread(_Parallel):
         velocities = [agent.state.p_vel for agent in world.agents]
         landmarks = [landmark.state.p_pos for landmark in world.landmarks]
         return np.concatenate([*positions, *velocities, *landmarks]).astype(np.float32)
-
-    def _touching(self) -> bool:
-        place = np.stack([agent.state.p_pos for agent in self.theirs.unwrapped.world.agents])
-        gap = np.linalg.norm(place[:, None] - place, axis=-1) + 9.0 * np.eye(len(place))
-        return bool((gap < CONTACT_DISTANCE).any())

@@ -31,7 +31,7 @@ from ringfence.envs import film
 from ringfence.envs.base import Outcome, Seed, Seen
 from ringfence.errors import UserError, needs, unknown
 from ringfence.problem.features import VIEWS, FeatureMap, Source
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 from ringfence.types import Array
 
 if TYPE_CHECKING:
@@ -188,14 +188,11 @@ class SafeMuJoCo:
         for joints in self.own_joints:
             own = sorted((self.joints[j] for j in joints), key=lambda name: (name.rstrip("0123456789"), name))
             moving = [at[f"{joint}.{c}"] for joint in own for c in "qv"]
-            near = [at[f"{joint}.q"] for joint in self._neighbours(joints)]
+            # joints next to those: the other legs' hips, or the other half's thigh
+            rest = [joint for k, joint in enumerate(self.joints) if k not in joints]
+            near = [at[f"{joint}.q"] for joint in rest if joint.startswith("hip") or joint.endswith("thigh")]
             rows.append(moving + near + torso)
         return np.array(rows)
-
-    def _neighbours(self, own: np.ndarray) -> list[str]:
-        """Joints next to those of an agent: the other legs' hips, or the other half's thigh."""
-        rest = [joint for k, joint in enumerate(self.joints) if k not in own]
-        return [joint for joint in rest if joint.startswith("hip") or joint.endswith("thigh")]
 
     @cached_property
     def observation_names(self) -> tuple[str, ...]:
@@ -208,7 +205,7 @@ class SafeMuJoCo:
 
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
         """Pictures of an episode (film.py)."""
-        return film.frames(self, states, moments)
+        return film.robot_frames(self, states, moments)
 
     def model(self) -> Any:
         """The MuJoCo model; the Ant's is refused on versions whose physics differs."""
@@ -254,7 +251,8 @@ class Simulation:
         self.batch = batch
         self._threads = threads
         model = env.model()
-        workers = max(1, min(threads or _cores(), batch))
+        cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+        workers = max(1, min(threads or cores, batch))
         try:
             self._robots = _Batch(model, batch, workers)
         except ImportError:  # before MuJoCo 3.17
@@ -371,13 +369,6 @@ def _mujoco() -> Any:
         import mujoco
 
     return mujoco
-
-
-def _cores() -> int:
-    """Those that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 class _Batch:

@@ -13,8 +13,7 @@ import numpy as np
 
 from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
-from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread
-from ringfence.envs.spread_alike import SpreadAlike
+from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread, SpreadAlike
 from ringfence.errors import UserError, needs
 
 with needs("sim", "Simulators behind PettingZoo's API"):

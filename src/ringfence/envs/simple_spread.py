@@ -20,8 +20,8 @@ import numpy as np
 
 from ringfence.envs.base import Defaults
 from ringfence.errors import UserError, unknown
-from ringfence.problem.features import VIEWS, FeatureMap, derived, following
-from ringfence.problem.others import others
+from ringfence.problem.features import VIEWS, FeatureMap, decentralized, derived, following
+from ringfence.problem.partners import approaches, others, seen_first
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s
@@ -31,6 +31,10 @@ CONTACT_FORCE = 100.0
 CONTACT_MARGIN = 1e-3
 AGENT_RADIUS = 0.15
 CONTACT_DISTANCE = 2 * AGENT_RADIUS
+# m, of SpreadAlike: in a room of 2 m a side, one thing in six is farther away, so what is not there is nothing new
+SIGHT = 1.5
+SOON = 0.3  # s: full speed is lost in three steps
+LANDMARKS, OTHERS = 3, 2  # that are seen
 
 Integrator = Literal["velocity_first", "position_first"]
 RewardName = Literal["omar", "pettingzoo", "coverage"]
@@ -127,7 +131,8 @@ class SimpleSpread(Defaults):
         n = self.n_agents
         batch = state.position.shape[:-2]
         landmarks = state.landmarks[..., None, :, :] - state.position[..., :, None, :]
-        offsets = _without_diagonal(state.position[..., None, :, :] - state.position[..., :, None, :])
+        offsets = state.position[..., None, :, :] - state.position[..., :, None, :]
+        offsets = offsets[..., *np.nonzero(~np.eye(n, dtype=bool)), :]  # but those to oneself, in order
         silence = jnp.zeros((*batch, n, 2 * (n - 1)), state.position.dtype)
         return jnp.concatenate(
             [
@@ -222,13 +227,6 @@ def _touching(x: Array, y: Array) -> Array:
     return (distance < CONTACT_DISTANCE) & ~itself
 
 
-def _without_diagonal(pairs: Array) -> Array:
-    """(..., N, N, F) -> (..., N, N-1, F): drop the diagonal, keeping the order of the others."""
-    n = pairs.shape[-2]
-    rows, columns = np.nonzero(~np.eye(n, dtype=bool))
-    return pairs[..., rows, columns, :].reshape(*pairs.shape[:-2], n - 1, pairs.shape[-1])
-
-
 def views(view: str, n_agents: int) -> FeatureMap:
     """The views of Simple Spread; state as in `SimpleSpread.global_state`, lengths in m, velocities in m/s."""
     if view == "centralized":
@@ -288,3 +286,91 @@ def _critic_weight(names: list[str]) -> tuple[float, ...]:
     do, in deviations. A critic that weighs both the same steers plans to speeds that their positions do not follow."""
     kinds = [name.split(".")[1].lstrip("d")[0] for name in names]
     return tuple(0.25 if kind == "v" else 1.0 for kind in kinds)
+
+
+@dataclass(frozen=True)
+class SpreadAlike(Defaults):
+    """Simple Spread as each agent sees it by itself, so that one policy plays any number of them, in pure JAX.
+
+    Simple Spread's own observations name every landmark and every other, and have another length for every number of
+    agents; and its room, once there are more than three, is four times as large. Here the room grows with the team, as
+    crowded as three agents have it, and everybody sees its velocity, the three landmarks nearest to it and the two
+    others who come nearest, as far as `SIGHT`, and is paid for itself. Nobody knows where in the room it is.
+    """
+
+    n_agents: int = 3
+    episode_length: int = 25
+
+    def __post_init__(self):
+        for field in ("n_agents", "episode_length"):
+            if getattr(self, field) < 1:
+                raise UserError(f"SpreadAlike {field}={getattr(self, field)} must be at least 1.")
+
+    @property
+    def action_dim(self) -> int:
+        """A force's direction."""
+        return 2
+
+    @property
+    def whole(self) -> SimpleSpread:
+        """The simulator, in a room as crowded as three agents have it."""
+        return SimpleSpread(self.n_agents, episode_length=self.episode_length, arena=self.half_width)
+
+    @property
+    def half_width(self) -> float:
+        """m, half of the room's side."""
+        return float(np.sqrt(self.n_agents / 3))
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        names = ["own.vx", "own.vy"]
+        names += [f"landmark{j}.{x}" for j in range(LANDMARKS) for x in ("dx", "dy", "seen")]
+        return tuple(names + [f"other{j}.{x}" for j in range(OTHERS) for x in ("dx", "dy", "dvx", "dvy", "seen")])
+
+    @property
+    def observation_dim(self) -> int:
+        return len(self.observation_names)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the entries of `global_state`, in order."""
+        return self.whole.state_names
+
+    def feature_map(self, view: str) -> FeatureMap:
+        """s̃_i: what the agent sees. There is no other view."""
+        return decentralized(view, self.observation_names, DT)
+
+    def reset(self, key: Key, batch: int) -> SpreadState:
+        """As Simple Spread's: starts in contact are part of the task."""
+        return self.whole.reset(key, batch)
+
+    def step(self, state: SpreadState, action: Array) -> tuple[SpreadState, Transition]:
+        """One step of 0.1 s; `action` (B, N, 2) in [-1, 1] is clipped. Costs are of each agent, 0 or 1: whether it
+        touches another after the step."""
+        after, transition = self.whole.step(state, action)
+        return after, transition._replace(cost=touching(after))
+
+    def observe(self, state: SpreadState) -> Array:
+        """(B, N, O) as `observation_names` says. What is not seen stands at the end of sight, `seen` = 0."""
+        n = self.n_agents
+        landmarks = state.landmarks[..., None, :, :] - state.position[..., :, None, :]  # (B, N, N, 2)
+        offset, speed, approach = approaches(state.position, state.velocity, SIGHT, SOON)
+        parts = [
+            state.velocity,
+            seen_first((landmarks**2).sum(-1), LANDMARKS, n, SIGHT, landmarks),
+            seen_first(approach, OTHERS, n - 1, SIGHT, offset, speed),
+        ]
+        return jnp.concatenate(parts, -1)
+
+    def global_state(self, state: SpreadState) -> Array:
+        """(B, 6N) as Simple Spread's."""
+        return self.whole.global_state(state)
+
+    def from_global_state(self, flat: Array) -> SpreadState:
+        """Inverse of `global_state`."""
+        return self.whole.from_global_state(flat)
+
+
+def touching(state: SpreadState) -> Array:
+    """(..., N) 1 for who touches another, else 0."""
+    return in_contact(state.position).any(-1).astype(jnp.float32)

@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from ringfence.errors import UserError
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.faults.faults import Faults
+from ringfence.faults import Faults
 from ringfence.guards.options import GuardOptions
 from ringfence.loading.spec import SOURCES
 from ringfence.utils import schemas

@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from ringfence.envs.base import Moment
 from ringfence.envs.episode import Cost, Episode
-from ringfence.envs.rollout import Moment
 from ringfence.evaluation.play import play_all, simulators_of
 from ringfence.evaluation.player import player_of_run
 from ringfence.evaluation.rollout import FORESEEN, RESETS

@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ringfence.envs.base import Seen
+from ringfence.envs.base import Moment, Seen, Watch, nobody
 from ringfence.envs.episode import Episode
-from ringfence.envs.rollout import Moment, Watch, nobody
 from ringfence.evaluation.recordings import Recording
-from ringfence.problem.names import Names
+from ringfence.problem.entries import Names
 
 EPISODES = 4  # that are kept
 LONGEST = 2000  # steps that are kept of each

@@ -10,9 +10,8 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
-from ringfence.envs.rollout import Moment, Watch, nobody, rollout, split_off
-from ringfence.envs.side_by_side import SideBySide
+from ringfence.envs.base import Moment, Watch, nobody, rollout, split_off
+from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, SideBySide
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
 from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated
@@ -23,7 +22,7 @@ from ringfence.evaluation.rollout import COUNTED, RESETS, Acting
 from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
 from ringfence.problem.bounds import Bounds
-from ringfence.problem.names import Names
+from ringfence.problem.entries import Names
 from ringfence.training.runs import Run
 from ringfence.types import Key
 from ringfence.utils import interrupts

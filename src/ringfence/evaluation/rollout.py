@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs import rollout as outside
+from ringfence.envs import base as outside
 from ringfence.envs.base import NativeEnv, PureEnv
 from ringfence.errors import UserError
 from ringfence.faults.policy import Faulty
@@ -30,7 +30,7 @@ _compiled_act = in_float32(jax.jit(act_with))
 
 
 class Acting:
-    """A policy as `envs.rollout` plays it: compiled where it can be, and in 32 bits, whatever the precision of the
+    """A policy as `envs.base.rollout` plays it: compiled where it can be, and in 32 bits, whatever the precision of the
     simulator. What JAX cannot take apart acts in its own."""
 
     def __init__(self, policy: Policy):

@@ -11,7 +11,7 @@ from typing import Any
 from ringfence.errors import UserError
 from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
-from ringfence.logs.provenance import other_data
+from ringfence.logs.schema import other_data
 from ringfence.training.runs import Run
 
 Result = dict[str, Any]  # a summary of episodes as results.json has it (schemas.Result), under today's names

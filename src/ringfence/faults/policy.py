@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError
-from ringfence.faults.faults import Faults
+from ringfence.faults import Faults
 from ringfence.types import Array, Bound, Key, ObservesDelay, Policy, PolicyStep, PyTree, with_cost
 
 EXACT = ("seen", "draw")  # entries that are no measurements, by the ends of their names

@@ -13,7 +13,7 @@ from ringfence.guards.filter import Guard
 from ringfence.guards.options import GuardOptions
 from ringfence.proposals.base import held
 from ringfence.types import Array
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world import World, cause_candidates
 from ringfence.world.card import UNKNOWN
 from ringfence.world.cause_counts import Explained, counted, some_steps

@@ -12,20 +12,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, is_vector, made
+from ringfence.envs.base import Memoryless, Moment, rollout
+from ringfence.envs.episode import EARLY_ENDS, Cost, Shape, SideBySide, is_vector, made
 from ringfence.envs.padded import PaddedEnv
-from ringfence.envs.rollout import Memoryless, Moment, rollout
-from ringfence.envs.side_by_side import SideBySide
 from ringfence.errors import Interrupted, StoreError, UserError, known, of_kind, whole_number
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.origins import FIELDS as ORIGINS
-from ringfence.problem.origins import Origins
 from ringfence.utils import interrupts
-from ringfence.utils.content import content_of
 from ringfence.utils.files import writable
-from ringfence.utils.functions import of_both
+from ringfence.utils.functions import content_of, of_both
 from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
 
@@ -86,7 +83,7 @@ def collect(
         return kept
     space = _space(env)
     shape = Shape(state=None if _has_state(env, seed) else 0, double=True)
-    simulators = SideBySide([env], shape, max_episode_steps, early_ends, cost, _free)
+    simulators = SideBySide([env], shape, max_episode_steps, early_ends, cost, lambda seen, state: np.zeros(len(seen)))
     keeper = _Keeper(env, space.bounds, source, card, file, kept, _skipped(kept))
     simulator = source["simulator"]
     begun = _begun(kept)
@@ -106,11 +103,6 @@ def collect(
     if keeper.kept is None:
         raise UserError(f"All {episodes} episodes of {simulator} were skipped: agents leave each; cut them.")
     return keeper.kept
-
-
-def _free(observations: np.ndarray, state: np.ndarray | None) -> np.ndarray:
-    """(B,) what steps cost whose simulator tells none."""
-    return np.zeros(len(observations))
 
 
 @dataclass(eq=False)
@@ -330,7 +322,8 @@ def _store(
     if like is not None:
         said = {name: value for name in (*ORIGINS, "warnings") if (value := getattr(like.card, name))}
         card = card | said
-        played = [_moved(one, like.card.origins) for one in played]
+        moved = [like.card.origins.taken(one.observations, one.state) for one in played]  # in single precision
+        played = [replace(one, observations=seen, state=state) for one, (seen, state) in zip(played, moved)]
 
     constraints = {name: charged([one.constraints[name] for one in played]) for name in names}
     states = [one.state for one in played if one.state is not None]
@@ -356,12 +349,6 @@ def _store(
             **card,
         },
     )
-
-
-def _moved(played: _Played, origins: Origins) -> _Played:
-    """The episode in single precision, moved as others were."""
-    observations, state = origins.taken(played.observations, played.state)
-    return replace(played, observations=observations, state=state)
 
 
 def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> EpisodeStore | None:

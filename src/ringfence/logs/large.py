@@ -27,8 +27,7 @@ from ringfence.logs.resolution import coarse
 from ringfence.logs.schema import ARRAYS, OPTIONAL, StoreCard
 from ringfence.logs.store import EpisodeStore, Pieces, write
 from ringfence.utils import interrupts
-from ringfence.utils.cache import elsewhere
-from ringfence.utils.files import writable
+from ringfence.utils.files import elsewhere, writable
 from ringfence.utils.progress import Progress
 
 LARGE = 4_000_000  # rows, from which on tables are read in parts

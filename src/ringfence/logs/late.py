@@ -161,13 +161,18 @@ class _Explained:
         return self._left()
 
     def _left(self, *late: int) -> np.ndarray:
-        """Squared error (D,) by the commands of so many steps before."""
-        told = [part for k in late for part in self._told(k)]
-        return _squared_error(np.concatenate([self.known, *told], 1), self.change, self.out)
-
-    def _told(self, late: int) -> list[np.ndarray]:
-        action = _standardised(self.actions[:, late])
-        return [action, *_products(action, self.x)]
+        """Squared error (D,) by the commands of so many steps before: of the least squares fit to the other steps, on
+        those held out."""
+        told = [self.known]
+        for k in late:
+            action = _standardised(self.actions[:, k])
+            told.append(action)
+            if action.shape[1] * self.x.shape[1] <= PRODUCTS:  # what commands do where a body heads elsewhere
+                told.append((action[:, :, None] * self.x[:, None, :]).reshape(len(action), -1))
+        x, y = np.concatenate(told, 1), self.change
+        fitted = x[~self.out]
+        weights = np.linalg.solve(fitted.T @ fitted + RIDGE * len(x) * np.eye(x.shape[1]), fitted.T @ y[~self.out])
+        return ((y[self.out] - x[self.out] @ weights) ** 2).sum(0)
 
 
 def _some_entries(x: np.ndarray) -> np.ndarray:
@@ -175,21 +180,7 @@ def _some_entries(x: np.ndarray) -> np.ndarray:
     return x if x.shape[-1] <= ENTRIES else x[..., np.linspace(0, x.shape[-1] - 1, ENTRIES).astype(int)]
 
 
-def _products(action: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
-    """What commands do where a body heads elsewhere; nothing where that is too much to look at."""
-    if action.shape[1] * x.shape[1] > PRODUCTS:
-        return []
-    return [(action[:, :, None] * x[:, None, :]).reshape(len(x), -1)]
-
-
 def _standardised(x: np.ndarray) -> np.ndarray:
     """Entries that vary, with mean 0 and deviation 1."""
     x = x[:, x.std(0) > FLAT * np.abs(x).max(0)]
     return (x - x.mean(0)) / x.std(0)
-
-
-def _squared_error(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """(D,) of the least squares fit to the other steps, on those held out."""
-    fitted = x[~out]
-    weights = np.linalg.solve(fitted.T @ fitted + RIDGE * len(x) * np.eye(x.shape[1]), fitted.T @ y[~out])
-    return ((y[out] - x[out] @ weights) ** 2).sum(0)

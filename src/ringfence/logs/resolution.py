@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from ringfence.errors import StoreError
-from ringfence.logs.moving import gap_at
+from ringfence.logs.moving import gap_at, looked_at
 from ringfence.logs.store import EpisodeStore
 
 COARSE = 0.01  # of an entry's deviation: the distance of neighbouring numbers above which it is coarse
 BLURRED = 0.25  # of what it changes by in a step: the distance above which nothing can be learned of its change
-STEPS = 20_000  # that are looked at, at most
 
 
 def coarse(store: EpisodeStore) -> list[str]:
@@ -32,8 +31,7 @@ def coarse(store: EpisodeStore) -> list[str]:
 
 def require_resolved(store: EpisodeStore) -> None:
     """Refuse logs of which an entry changes by hardly more than single precision tells apart."""
-    steps = np.unique(np.linspace(0, store.steps - 1, STEPS).astype(int))
-    rows = steps + np.searchsorted(store.episode_ends, steps, side="right")
+    rows = looked_at(store.episode_ends)
     for what, array, names in _sources(store):
         flat = array.reshape(len(array), -1, array.shape[-1])
         change = np.abs(flat[rows + 1] - flat[rows])

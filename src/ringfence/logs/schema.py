@@ -27,6 +27,9 @@ OPTIONAL = ("state", "speed", "constraints")
 ROWS = ("observations", "state")  # arrays with one row more than steps in every episode
 LIKELY = 0.85  # similarity of two names, from which one is taken for the other mistyped
 WORDS = ("simulator", "provenance", "content")
+# What a card says of where its steps come from; the rest describes them, and later versions describe more.
+ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard", "content")
+ORIGIN += ORIGINS
 LISTS_OF_NAMES = ("observation_names", "state_names")
 ALWAYS = (
     "task",
@@ -164,6 +167,19 @@ def given_card(given: GivenCard | None) -> StoreCard:
     return complete_card(given)
 
 
+def regenerated(card: dict) -> bool:
+    """Whether `ringfence data make` made the steps: the same anywhere, but for a processor's rounding."""
+    return str(card.get("provenance", "")).startswith("regenerated")
+
+
+def other_data(here: dict, there: dict) -> list[tuple[str, object, object]]:
+    """(name, here, there) of what two cards contradict each other in; a field that one of them lacks says nothing, and
+    neither does the digest of regenerated data, which another processor rounds otherwise."""
+    both = [k for k in ORIGIN if k in here and k in there]
+    rounded = {"content"} if regenerated(here) and regenerated(there) else set()
+    return [(k, here[k], there[k]) for k in both if k not in rounded and here[k] != there[k]]
+
+
 def validate(store: Arrays) -> None:
     """Raise `StoreError` naming the array, the rule it breaks and the remedy."""
     for rule in STORE_RULES:
@@ -172,7 +188,12 @@ def validate(store: Arrays) -> None:
 
 # --- rules of a card, which they also bring into its stored form ---
 def _task_is_a_name(card: dict) -> None:
-    if not _is_name(card["task"]):
+    try:
+        schemas.check(card["task"], schemas.Name)
+        named = bool(card["task"].strip())
+    except ValueError:
+        named = False
+    if not named:
         raise StoreError(
             f"The card has task={repr(card['task'])[:200]}; it must be a name without slashes, line breaks or a "
             "leading dot or dash, of at most 120 letters, since folders of runs are called so."
@@ -185,17 +206,12 @@ def _action_bounds(card: dict) -> None:
     card["action_high"] = stored_bound(bounds.high)
 
 
-def _cost_limit(card: dict) -> None:
-    if "cost_limit" in card and not (_is_number(card["cost_limit"]) and card["cost_limit"] >= 0):
-        raise StoreError(f"The card has cost_limit={card['cost_limit']!r}; it must be one number, 0 or more.")
-
-
 def _constraint_limits(card: dict) -> None:
     limits = card.get("constraints")
     if limits is None:
         return
     try:
-        limits = {name: _plain(limit) for name, limit in limits.items()}
+        limits = {name: x.item() if isinstance(x, np.number) else x for name, x in limits.items()}
         schemas.check(limits, schemas.Limits)
     except (AttributeError, ValueError):
         raise StoreError(
@@ -206,7 +222,10 @@ def _constraint_limits(card: dict) -> None:
     card.setdefault("cost_limit", float(sum(limits.values())))
 
 
-def _lists_of_words(card: dict) -> None:
+def _words(card: dict) -> None:
+    for name in WORDS:
+        if not isinstance(card.get(name), str | None):
+            raise StoreError(f"The card has {name}={repr(card[name])[:200]}; it must be text, or be left out.")
     for name in (*LISTS_OF_NAMES, "agents", "warnings"):
         words = card.get(name)
         words = words.tolist() if isinstance(words, np.ndarray) else words
@@ -221,23 +240,48 @@ def _lists_of_words(card: dict) -> None:
             raise StoreError(f"The card has {name}={str(words)[:200]}; it must be {rule}.")
         if name in card:
             card[name] = words if words is None else list(words)
-        if words and name in LISTS_OF_NAMES:
-            _names_differ(name, list(words))
+    for name in LISTS_OF_NAMES:
+        names = card.get(name) or []
+        wrong = [one for k, one in enumerate(names) if one in names[:k] or not one.isprintable()]
+        if wrong:
+            raise StoreError(
+                f"The card has {name} with {wrong[0]!r} twice or unprintable; give every entry its own name."
+            )
 
 
-def _words(card: dict) -> None:
-    for name in WORDS:
-        if not isinstance(card.get(name), str | None):
-            raise StoreError(f"The card has {name}={repr(card[name])[:200]}; it must be text, or be left out.")
+def _is_number(x) -> bool:
+    try:
+        return isinstance(x, int | float | np.number) and not isinstance(x, bool) and math.isfinite(x)
+    except (OverflowError, TypeError):  # an integer of hundreds of digits; a complex number
+        return False
 
 
-def _sensing_radius(card: dict) -> None:
-    radius = card.get("sensing_radius")
-    if radius is not None and not (radius == math.inf or (_is_number(radius) and radius > 0)):
-        raise StoreError(f"The card has sensing_radius={repr(radius)[:200]}; it must be a number of metres above 0.")
+# What fields must be, where the card has them: a test, and it in words.
+SINGLE: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "cost_limit": (lambda x: _is_number(x) and x >= 0, "one number, 0 or more"),
+    "sensing_radius": (
+        lambda x: x is None or x == math.inf or (_is_number(x) and x > 0),
+        "a number of metres above 0",
+    ),
+    "dt": (lambda x: _is_number(x) and x > 0, "the seconds of a step, a number above 0"),
+    "team": (
+        lambda x: x is None or (_is_number(x) and x >= 1 and float(x).is_integer()),
+        "the number of agents of a team, 1 or more",
+    ),
+    "action_delay": (
+        lambda x: _is_number(x) and x >= 0 and float(x).is_integer(),
+        "a whole number of steps, 0 or more",
+    ),
+    "homogeneous": (lambda x: isinstance(x, bool), "true or false"),
+}
 
 
-def _origins(card: dict) -> None:
+def _numbers(card: dict) -> None:
+    for name, (is_sound, rule) in SINGLE.items():
+        if name in card and not is_sound(card[name]):
+            raise StoreError(f"The card has {name}={repr(card[name])[:200]}; it must be {rule}.")
+    if "action_delay" in card:
+        card["action_delay"] = int(card["action_delay"])
     for name in ORIGINS:
         origins = card.get(name)
         origins = origins.tolist() if isinstance(origins, np.ndarray) else origins
@@ -248,36 +292,6 @@ def _origins(card: dict) -> None:
             )
         if name in card:
             card[name] = origins if origins is None else [float(x) for x in origins]
-
-
-def _names_differ(field: str, names: list[str]) -> None:
-    wrong = [name for k, name in enumerate(names) if name in names[:k] or not name.isprintable()]
-    if wrong:
-        raise StoreError(f"The card has {field} with {wrong[0]!r} twice or unprintable; give every entry its own name.")
-
-
-def _seconds_of_a_step(card: dict) -> None:
-    if "dt" in card and not (_is_number(card["dt"]) and card["dt"] > 0):
-        raise StoreError(f"The card has dt={card['dt']!r}; it must be the seconds of a step, a number above 0.")
-
-
-def _team(card: dict) -> None:
-    team = card.get("team")
-    if team is not None and not (_is_number(team) and team >= 1 and float(team).is_integer()):
-        raise StoreError(f"The card has team={team!r}; it must be the number of agents of a team, 1 or more.")
-
-
-def _action_delay(card: dict) -> None:
-    delay = card.get("action_delay", 0)
-    if not (_is_number(delay) and delay >= 0 and float(delay).is_integer()):
-        raise StoreError(f"The card has action_delay={delay!r}; it must be a whole number of steps, 0 or more.")
-    if "action_delay" in card:
-        card["action_delay"] = int(delay)
-
-
-def _homogeneous(card: dict) -> None:
-    if not isinstance(card.get("homogeneous", False), bool):
-        raise StoreError(f"The card has homogeneous={card['homogeneous']!r}; it must be true or false.")
 
 
 def _hazard(card: dict) -> None:
@@ -300,35 +314,6 @@ def _hazard(card: dict) -> None:
         raise StoreError(f"The card has hazard={card['hazard']!r}, which is none; see docs/data.md.")
 
 
-CARD_RULES: tuple[Callable[[dict], None], ...] = (
-    _task_is_a_name,
-    _action_bounds,
-    _cost_limit,
-    _constraint_limits,
-    _words,
-    _lists_of_words,
-    _sensing_radius,
-    _origins,
-    _seconds_of_a_step,
-    _team,
-    _action_delay,
-    _homogeneous,
-    _hazard,
-)
-
-
-def _is_number(x) -> bool:
-    try:
-        return isinstance(x, int | float | np.number) and not isinstance(x, bool) and math.isfinite(x)
-    except (OverflowError, TypeError):  # an integer of hundreds of digits; a complex number
-        return False
-
-
-def _plain(x):
-    """A number of NumPy's as Python's."""
-    return x.item() if isinstance(x, np.number) else x
-
-
 def _is_sound(hazard: constraints.Hazard) -> bool:
     """Whether a hazard has the sizes that define it, and names its features with words."""
     match hazard:
@@ -342,19 +327,19 @@ def _is_sound(hazard: constraints.Hazard) -> bool:
             return True
 
 
-def _is_name(word) -> bool:
-    """Whether a word can become that of a folder or file."""
-    try:
-        schemas.check(word, schemas.Name)
-    except ValueError:
-        return False
-    return bool(word.strip())
+CARD_RULES = (_task_is_a_name, _action_bounds, _constraint_limits, _words, _numbers, _hazard)
 
 
 # --- rules of a store's arrays, in the order in which they can be asked ---
 def _demand(ok: bool, message: str) -> None:
     if not ok:
         raise StoreError(message)
+
+
+def _arrays(store: Arrays) -> list[tuple[str, np.ndarray]]:
+    """Those that are there, by name."""
+    optional = [(name, getattr(store, name)) for name in OPTIONAL]
+    return [(name, getattr(store, name)) for name in ARRAYS] + [(k, x) for k, x in optional if x is not None]
 
 
 def _kinds(store: Arrays) -> None:
@@ -374,22 +359,14 @@ def _kinds(store: Arrays) -> None:
         _demand(array.dtype.isnative, f"{name} holds bytes in the order of another machine; call .astype('f4') on it.")
 
 
-def _arrays(store: Arrays) -> list[tuple[str, np.ndarray]]:
-    """Those that are there, by name."""
-    optional = [(name, getattr(store, name)) for name in OPTIONAL]
-    return [(name, getattr(store, name)) for name in ARRAYS] + [(k, x) for k, x in optional if x is not None]
-
-
-def _actions(store: Arrays) -> None:
+def _steps(store: Arrays) -> None:
+    """Actions of some agents, and episodes that hold all of them."""
     shape = store.actions.shape
     _demand(len(shape) == 3, f"actions has shape {shape}, expected (T, N, A); add the missing axis.")
     _demand(
         shape[1] > 0 and shape[2] > 0,
         f"actions has shape {shape}; a store needs at least one agent and one action entry.",
     )
-
-
-def _episode_ends(store: Arrays) -> None:
     ends = store.episode_ends
     steps = len(store.actions)
     _demand(ends.ndim == 1 and len(ends) > 0, "episode_ends is empty; a store needs at least one whole episode.")
@@ -425,39 +402,11 @@ def _shapes(store: Arrays) -> None:
             f"state has shape {store.state.shape}, expected ({steps + episodes}, S); keep the state each episode "
             "ended in.",
         )
-
-
-def _costs_are_known(store: Arrays) -> None:
-    known = np.isfinite(store.costs).mean()
-    _demand(
-        known > 0.5 or known == 1,
-        f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop "
-        "episodes of which nobody knows.",
-    )
-
-
-def _speed(store: Arrays) -> None:
-    if store.speed is None:
-        return
-    steps = len(store.actions)
-    _demand(
-        store.speed.shape == (steps,),
-        f"speed has shape {store.speed.shape}, expected ({steps},); give one of every step.",
-    )
-
-
-def _finite(store: Arrays) -> None:
-    for name, array in _arrays(store):
-        if name in ("terminated", "truncated", "episode_ends"):
-            continue
-        if np.isfinite(array).all():
-            most = float(np.abs(array).max(initial=0))
-            _demand(
-                most <= LARGEST,
-                f"{name} reaches {most:.3g}, beyond {LARGEST:g}, what 32 bits can be learned from; scale it.",
-            )
-            continue
-        raise StoreError(f"{_first(store, name, ~np.isfinite(array))}; remove or repair that episode.")
+    if store.speed is not None:
+        _demand(
+            store.speed.shape == (steps,),
+            f"speed has shape {store.speed.shape}, expected ({steps},); give one of every step.",
+        )
 
 
 def _first(store: Arrays, name: str, wrong: np.ndarray) -> str:
@@ -477,7 +426,24 @@ def _demand_no_negative(name: str, store: Arrays) -> None:
         )
 
 
-def _costs(store: Arrays) -> None:
+def _sizes(store: Arrays) -> None:
+    """Finite numbers that can be learned from; costs of 0 and above, known of every step."""
+    known = np.isfinite(store.costs).mean()
+    _demand(
+        known > 0.5 or known == 1,
+        f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop "
+        "episodes of which nobody knows.",
+    )
+    for name, array in _arrays(store):
+        if name in ("terminated", "truncated", "episode_ends"):
+            continue
+        if not np.isfinite(array).all():
+            raise StoreError(f"{_first(store, name, ~np.isfinite(array))}; remove or repair that episode.")
+        most = float(np.abs(array).max(initial=0))
+        _demand(
+            most <= LARGEST,
+            f"{name} reaches {most:.3g}, beyond {LARGEST:g}, what 32 bits can be learned from; scale it.",
+        )
     _demand_no_negative("costs", store)
 
 
@@ -536,72 +502,50 @@ def _episodes_end_in_one_way(store: Arrays) -> None:
     _demand(not (over & ~last).any(), "A step inside an episode is flagged as its end; split the episode there.")
 
 
-def _action_sizes(store: Arrays) -> None:
-    sizes = store.card.action_sizes
-    if sizes is None:
-        return
-    n_agents, widest = store.actions.shape[1:]
-    counted = isinstance(sizes, list | tuple) and len(sizes) == n_agents
+def _agents_as_the_card_says(store: Arrays) -> None:
+    card, (n_agents, widest) = store.card, store.actions.shape[1:]
+    sizes = card.action_sizes
+    if sizes is not None:
+        counted = isinstance(sizes, list | tuple) and len(sizes) == n_agents
+        _demand(
+            counted and all(type(size) is int and 1 <= size <= widest for size in sizes),
+            f"The card has action_sizes={sizes!r}; it must say for each of the {n_agents} agents how many entries its "
+            f"action has, 1 to {widest}.",
+        )
     _demand(
-        counted and all(type(size) is int and 1 <= size <= widest for size in sizes),
-        f"The card has action_sizes={sizes!r}; it must say for each of the {n_agents} agents how many entries its "
-        f"action has, 1 to {widest}.",
-    )
-
-
-def _team_of_one(store: Arrays) -> None:
-    n_agents = store.actions.shape[1]
-    _demand(
-        store.card.team is None or n_agents == 1,
-        f"The card has team={store.card.team}, which logs of single agents have that were split from a team's, and the "
+        card.team is None or n_agents == 1,
+        f"The card has team={card.team}, which logs of single agents have that were split from a team's, and the "
         f"data has {n_agents} agents; leave it out.",
     )
-
-
-def _names_of_agents(store: Arrays) -> None:
-    agents = store.card.agents
-    n_agents = store.actions.shape[1]
-    if agents is not None and n_agents > 1:  # logs of one at a time may be of many
+    if card.agents is not None and n_agents > 1:  # logs of one at a time may be of many
         _demand(
-            len(set(agents)) == n_agents,
-            f"The card names the agents {str(agents)[:SHOWN]}, the data has {n_agents}; give each its own name.",
+            len(set(card.agents)) == n_agents,
+            f"The card names the agents {str(card.agents)[:SHOWN]}, the data has {n_agents}; give each its own name.",
         )
 
 
-def _names_of_entries(store: Arrays) -> None:
-    names = store.card.observation_names
-    size = store.observations.shape[2]
-    if names:
+def _entries_as_the_card_says(store: Arrays) -> None:
+    card, size = store.card, store.observations.shape[2]
+    if names := card.observation_names:
         _demand(len(names) == size, f"The card names {len(names)} observation entries, the data has {size}.")
-    names = store.card.state_names
-    if names and store.state is not None:
+    if (names := card.state_names) and store.state is not None:
         size = store.state.shape[1]
         _demand(len(names) == size, f"The card names {len(names)} state entries, not {size}.")
-
-
-def _origins_of_entries(store: Arrays) -> None:
     for field, array in zip(ORIGINS, (store.observations, store.state)):
-        origins = getattr(store.card, field)
+        origins = getattr(card, field)
         if origins is not None and array is not None:
             size = array.shape[-1]
             _demand(len(origins) == size, f"The card has {len(origins)} {field}, the data has {size} such entries.")
 
 
-STORE_RULES: tuple[Callable[[Arrays], None], ...] = (
+STORE_RULES = (
     _kinds,
-    _actions,
-    _episode_ends,
+    _steps,
     _shapes,
-    _costs_are_known,
-    _speed,
-    _finite,
-    _costs,
+    _sizes,
     _constraints,
     _actions_within_bounds,
     _episodes_end_in_one_way,
-    _action_sizes,
-    _team_of_one,
-    _names_of_agents,
-    _names_of_entries,
-    _origins_of_entries,
+    _agents_as_the_card_says,
+    _entries_as_the_card_says,
 )

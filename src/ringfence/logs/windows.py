@@ -16,7 +16,7 @@ import numpy as np
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import normalise
 from ringfence.types import Array, Batch, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 
 NOT_ARRIVED = -1.0  # cost of an episode's first row: nothing was charged on arriving there, so nobody knows
 
@@ -26,7 +26,7 @@ class WindowData:
 
     M = T + E rows of states, T steps. `arrays` is a pytree of device arrays that jitted functions take as an
     argument, so that the data is never baked into a compiled program. `scores` (T,) is the condition of the window that
-    begins at each step (scores.py), for algorithms that read one.
+    begins at each step, for algorithms that read one.
     """
 
     def __init__(self, store: EpisodeStore, features: Callable, scores: np.ndarray | None = None):

@@ -12,7 +12,7 @@ import numpy as np
 import optax
 
 from ringfence.types import Array, Key, Metrics, PyTree
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.utils.progress import Progress
 
 CHUNKS = 40  # a regression is in, one after the other, so that its progress is seen

@@ -233,11 +233,6 @@ def reads(hazard: Hazard, n_agents: int, names: tuple[str, ...]) -> tuple[str, .
     return ()
 
 
-def _is_size(value: object) -> bool:
-    """Whether it is a finite number, 0 or more."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < float("inf")
-
-
 def _missing(kind: str, name: str, names: tuple[str, ...]) -> UserError:
     near = unknown("feature", name, names)
     return UserError(f"{kind} reads the feature '{name}', which this data does not have: name it in the card. {near}")
@@ -267,6 +262,7 @@ def from_dict(data: Mapping[str, Any]) -> Hazard:
             raise UserError(f"Hazard {kind} needs a value of '{name}'; add it to the card.")
     for name in ("radius", "limit", "safe_margin"):
         value = data.get(name)
-        if value is not None and not _is_size(value):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (number and 0 <= value < float("inf")):
             raise UserError(f"Hazard {kind} has {name}={value!r}; it must be a number, 0 or more, and finite.")
     return kinds[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})

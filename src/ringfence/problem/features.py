@@ -21,18 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.problem import on_map, partners, turns
+from ringfence.problem import motion, on_map, partners
 from ringfence.problem.entries import Entries, axes_of
-from ringfence.problem.kinematics import late_share
-from ringfence.problem.others import order_in, others
-from ringfence.problem.partners import Mirrored
-from ringfence.problem.turns import Turn
+from ringfence.problem.motion import Turn, late_share
+from ringfence.problem.partners import Mirrored, order_in, others
 from ringfence.types import Array, X
 
 View = Literal["pruned", "centralized", "decentralized"]
 Source = Literal["state", "observations"]
 VIEWS = ("pruned", "centralized", "decentralized")
 _TABLES = ("plus", "minus", "origin", "order")  # fields of a map that are arrays
+STEPS = 4000  # or rows, that are looked at
+ROWS = 10_000  # of a column that are looked at together
 FIRST = 1000  # rows by which columns are told apart before all of them are compared
 
 
@@ -104,18 +104,15 @@ class FeatureMap:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out. Only the
         `source` is read."""
         if self.source == "state":
-            return self._of_state(state)
+            if state is None:
+                raise UserError(
+                    f"View '{self.view}' needs the global state, which this data does not have; "
+                    "store it or use view='decentralized'."
+                )
+            return self._less(state[..., self.plus], lambda entries: state[..., entries])
         assert observations is not None, "a map of observations is given some"
         rows = np.arange(self.plus.shape[0])[:, None]
         return self._less(observations[..., rows, self.plus], lambda entries: observations[..., rows, entries])
-
-    def _of_state(self, state: X | None) -> X:
-        if state is None:
-            raise UserError(
-                f"View '{self.view}' needs the global state, which this data does not have; "
-                "store it or use view='decentralized'."
-            )
-        return self._less(state[..., self.plus], lambda entries: state[..., entries])
 
     def _less(self, entries: X, source: Callable[[np.ndarray], X]) -> X:
         """(..., N, D) entries less those that are taken from them, which `source` gives."""
@@ -137,7 +134,7 @@ class FeatureMap:
 
     def apart(self, after: X, before: X) -> X:
         """(..., D) how far features are from others; of angles, the shorter way round."""
-        return turns.apart(self.turns, after, before)
+        return motion.apart(self.turns, after, before)
 
     def agreed(self, plan: Array, history: int = 0) -> Array:
         """Plans (B, history + H, N, D) whose agents agree on where everybody will be, where the view knows how."""
@@ -386,9 +383,9 @@ def from_data(
     if view == "centralized" and state is None:
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
     plain = _pruned_map(view, observations, state, observation_names, state_names, first_rows, set(keep), team)
-    steps = _logged_steps(plain, observations, state, first_rows)
+    steps = _Steps.of(plain, observations, state, first_rows)
     if steps is not None:
-        plain = replace(plain, turns=turns.found_in(steps.before, steps.after))
+        plain = replace(plain, turns=motion.turns_in(steps.before, steps.after))
     if view == "centralized":
         return plain
     if homogeneous and not axes_of(Entries.of(plain.names).own, "{}"):
@@ -396,7 +393,9 @@ def from_data(
         if dt is not None:
             return constant_velocity(plain, dt, _late(plain, steps, dt))
     if steps is not None:
-        plain = replace(plain, order=_order(plain, steps))
+        both = [jnp.asarray(x) for x in (steps.before, steps.after)]
+        before, after = (np.asarray(_with_products(x, headed(plain.names))) for x in both)
+        plain = replace(plain, order=order_in(after - before, derived(plain.names, plain.plus.shape[0])))
     how = _confirmed(plain, steps)
     if steps is not None and not any(other >= 0 for _, other in how.values()):
         plain = replace(plain, mirrored=partners.found_in(steps.before))
@@ -453,10 +452,12 @@ def _telling(columns: list[np.ndarray], known: set[int]) -> list[int]:
     kept: list[int] = []
     alike: dict[bytes, list[np.ndarray]] = {}  # by their first rows: there may be thousands
     for d, column in enumerate(columns):
-        if d in known or _constant(column):
+        # most vary at once, so the first rows are asked first
+        if d in known or all(np.ptp(some, axis=0).max() < 1e-9 for some in (column[:ROWS], column)):
             continue
         earlier = alike.setdefault((column[:FIRST].astype(np.float64) + 0.0).tobytes(), [])  # -0 is 0
-        if not any(_same(column, one) for one in earlier):
+        pieces = [slice(k, k + ROWS) for k in range(0, len(column), ROWS)]  # most differ at once
+        if not any(all(np.array_equal(column[piece], one[piece]) for piece in pieces) for one in earlier):
             earlier.append(column)
             kept.append(d)
     return kept
@@ -469,28 +470,17 @@ class _Steps:
     before: np.ndarray
     after: np.ndarray
 
-
-def _logged_steps(
-    map: FeatureMap,
-    observations: np.ndarray,
-    state: np.ndarray | None,
-    first_rows: np.ndarray | None,
-    steps: int = 4000,
-) -> _Steps | None:
-    """Some of the logged steps, evenly spread; None where there are too few."""
-    if len(observations) < 3:
-        return None
-    before = np.unique(np.linspace(0, len(observations) - 2, steps).astype(int))
-    if first_rows is not None:
-        before = before[~np.isin(before + 1, first_rows)]
-    start, end = (map(observations[rows], None if state is None else state[rows]) for rows in (before, before + 1))
-    return _Steps(start, end)
-
-
-def _order(map: FeatureMap, steps: _Steps) -> np.ndarray | None:
-    """Who the others are, where logged steps tell another order than the team's."""
-    before, after = (np.asarray(_with_products(jnp.asarray(x), headed(map.names))) for x in (steps.before, steps.after))
-    return order_in(after - before, derived(map.names, map.plus.shape[0]))
+    @classmethod
+    def of(
+        cls, map: FeatureMap, observations: np.ndarray, state: np.ndarray | None, first_rows: np.ndarray | None
+    ) -> _Steps | None:
+        """Evenly spread; None where there are too few."""
+        if len(observations) < 3:
+            return None
+        before = np.unique(np.linspace(0, len(observations) - 2, STEPS).astype(int))
+        if first_rows is not None:
+            before = before[~np.isin(before + 1, first_rows)]
+        return cls(*(map(observations[rows], None if state is None else state[rows]) for rows in (before, before + 1)))
 
 
 def _confirmed(map: FeatureMap, steps: _Steps | None) -> dict[int, tuple[int, int]]:
@@ -544,12 +534,10 @@ def _late(map: FeatureMap, steps: _Steps | None, dt: float) -> float:
     return 1.0 if share is None else share
 
 
-def _observed_too(
-    observations: np.ndarray, state: np.ndarray, keep: set[str], names: tuple[str, ...], rows: int = 4000
-) -> set[int]:
+def _observed_too(observations: np.ndarray, state: np.ndarray, keep: set[str], names: tuple[str, ...]) -> set[int]:
     """Entries of the state (M, S) that are an affine function of the observation of each agent (M, N, O), but for those
     to `keep`."""
-    some = np.unique(np.linspace(0, len(state) - 1, rows).astype(int))
+    some = np.unique(np.linspace(0, len(state) - 1, STEPS).astype(int))
     if len(some) < 4 * observations.shape[2]:
         return set()
     goal = np.asarray(state[some], np.float64)
@@ -563,16 +551,6 @@ def _observed_too(
         known &= left.std(0) <= 1e-4 * spread
     entries = np.flatnonzero(known & (spread > 0)).tolist()
     return {d for d in entries if not (names and names[d] in keep)}
-
-
-def _constant(column: np.ndarray, rows: int = 10_000) -> bool:
-    """Whether a column (M, N) never varies for any agent. Most vary at once, so the first rows are asked first."""
-    return all(np.ptp(some, axis=0).max() < 1e-9 for some in (column[:rows], column))
-
-
-def _same(a: np.ndarray, b: np.ndarray, rows: int = 10_000) -> bool:
-    """Whether two columns are equal; most differ at once, so they are compared piece by piece."""
-    return all(np.array_equal(a[k : k + rows], b[k : k + rows]) for k in range(0, len(a), rows))
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,8 @@ def _fields(steps: Steps) -> Iterator[_Field]:
             near = np.abs(x[:, 0] + x[:, k + 1, [first]]) <= EXACT * steps.deviation[first]
             mirrored = np.flatnonzero(near.mean(0) >= SHARE).tolist()
             entries += [e for e in mirrored if e not in entries][:1]
-        if len(entries) == agents - 1 and _mirrored(steps, entries):
+        seen = ((x[:, i, entries[j - 1]], -x[:, j, entries[i]], entries[i]) for i, j in _pairs(agents))
+        if len(entries) == agents - 1 and all(steps.equal(*each) for each in seen):
             yield _Field(tuple(entries))
 
 
@@ -153,12 +154,6 @@ def _own_of_listed(steps: Steps, entries: Sequence[int], who: np.ndarray, known:
 
 def _pairs(agents: int) -> Iterator[tuple[int, int]]:
     return ((i, j) for i in range(agents) for j in range(i + 1, agents))
-
-
-def _mirrored(steps: Steps, entries: list[int]) -> bool:
-    """Whether any two agents see each other with opposite signs; others are the team without oneself, in order."""
-    x = steps.before
-    return all(steps.equal(x[:, i, entries[j - 1]], -x[:, j, entries[i]], entries[i]) for i, j in _pairs(x.shape[1]))
 
 
 def _with_own(steps: Steps, found: _Field) -> _Field:
@@ -253,22 +248,17 @@ def _numbers(steps: Steps, found: Mapping[int, str], names: Sequence[str]) -> It
 
 def _of_axis(steps: Steps, place: _Field, axis: str) -> dict[int, str]:
     """Names, by entry, of the places and speeds of others and of oneself along an axis."""
-    own_speed = place.speed.own if place.speed else _own_speed(steps, place)
+    own_speed = place.speed.own if place.speed else None
+    if place.speed is None and place.own is not None:  # what one's own place changes by
+        entries = [e for e in range(len(steps.deviation)) if steps.varies(e) and e not in (place.own, *place.entries)]
+        left = [unlike(steps, [place.own], [e]) for e in entries]
+        own_speed = entries[int(np.argmin(left))] if left and min(left) <= LIKE else None
     own = {f"own.{axis}": place.own, f"own.v{axis}": own_speed}
     found = {entry: name for name, entry in own.items() if entry is not None}
     found |= {entry: f"other{k}.d{axis}" for k, entry in enumerate(place.entries)}
     if place.speed:
         found |= {entry: f"other{k}.dv{axis}" for k, entry in enumerate(place.speed.entries)}
     return found
-
-
-def _own_speed(steps: Steps, place: _Field) -> int | None:
-    """The entry that is the rate of change of one's own place."""
-    if place.own is None:
-        return None
-    entries = [e for e in range(len(steps.deviation)) if steps.varies(e) and e not in (place.own, *place.entries)]
-    left = [unlike(steps, [place.own], [e]) for e in entries]
-    return entries[int(np.argmin(left))] if left and min(left) <= LIKE else None
 
 
 def unlike(steps: Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray | None = None) -> float:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.types import Array, Bound, Spec, X
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 
 Coordinates = Literal["displacement", "state"]
 ROUNDING = 1e-5  # of an entry's size: less variation is rounding, and the entry is centred and left alone

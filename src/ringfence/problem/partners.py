@@ -1,13 +1,14 @@
-"""Who it is that an agent sees, where a list of others does not say.
+"""Who the others are that an agent sees.
 
-Others who are listed by how near they come change their places in the list. But what two see of each other is the same
-number, or the same with the opposite sign: how far apart they are, or where the other is. Nothing else in logs is so
-exact, so the agent that sees the same is the one that is seen.
+Entries number them: `other0` of an agent is the first of the team but itself, unless logs tell another order that
+stays, such as a ring's (next, opposite, previous). Others who are listed by how near they come change their places in
+the list. But what two see of each other is the same number, or the same with the opposite sign: how far apart they are,
+or where the other is. Nothing else in logs is so exact, so the agent that sees the same is the one that is seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -16,6 +17,9 @@ import numpy as np
 
 from ringfence.types import Array
 
+SHARE = 0.9  # of steps, that have to agree
+OFF = 0.05  # of a change: what follows is off by less
+LEAST = 1e-5  # of an entry: less is no change
 ROWS = 500  # that are compared
 MOST = 4_000_000  # numbers that are compared, and equal ones that are found; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
@@ -27,6 +31,71 @@ AT_ONCE = 256  # states in which others are looked up at once
 NEAREST = 3  # places, the first of a list, whose owners are looked for: each costs time
 SAME = 1e-6  # squared deviations between what two see of each other, where it is logged
 LIKE = 0.25  # and where it is predicted
+
+
+def others(n: int, most: int | None = None) -> np.ndarray:
+    """(N, N-1) who the others of each agent are: the team but itself, in order; no more than `most` of them."""
+    before = np.arange(n - 1)[:most]
+    return (before + (before >= np.arange(n)[:, None])).astype(int)
+
+
+def approaches(position: Array, velocity: Array, sight: float, soon: float) -> tuple[Array, Array, Array]:
+    """Offsets and relative velocities (B, N, N, 2) of everybody to everybody, and the squared distance (B, N, N) of
+    their nearest approach within `soon` s if all go on as now: beyond all others for who is out of `sight` m, and
+    beyond these for oneself."""
+    offset = position[..., None, :, :] - position[..., :, None, :]
+    speed = velocity[..., None, :, :] - velocity[..., :, None, :]
+    when = jnp.clip(-(offset * speed).sum(-1) / ((speed**2).sum(-1) + 1e-9), 0.0, soon)
+    squared = ((offset + when[..., None] * speed) ** 2).sum(-1)
+    in_sight = (offset**2).sum(-1) < sight**2
+    squared = jnp.where(in_sight, squared, 1e6) + 1e9 * jnp.eye(position.shape[-2])
+    return offset, speed, squared
+
+
+def seen_first(order: Array, shown: int, things: int, sight: float, offset: Array, *more: Array) -> Array:
+    """(..., N, shown (F + 1)) of the things at `offset` (..., N, M, 2) those that come first by `order` (..., N, M):
+    where each is, what `more` there is to tell (..., N, M, F - 2), and whether it is in sight. What is not seen stands
+    at the end of `sight` m. Only `things` of the M are things."""
+    count = min(shown, things)
+    _, which = jax.lax.top_k(-order, count)
+    near, *rest = (jnp.take_along_axis(x, which[..., None], -2) for x in (offset, *more))
+    rows = jnp.concatenate([near, *rest, jnp.ones_like(near[..., :1])], -1)
+    unseen = np.zeros(rows.shape[-1], np.float32)
+    unseen[0] = sight
+    rows = jnp.where((near**2).sum(-1, keepdims=True) < sight**2, rows, unseen)
+    missing = jnp.broadcast_to(unseen, (*rows.shape[:-2], shown - count, len(unseen)))
+    return jnp.concatenate([rows, missing], -2).reshape(*rows.shape[:-2], -1)
+
+
+def order_in(change: np.ndarray, how: Mapping[int, tuple[int, int]]) -> np.ndarray | None:
+    """(N, J) who the others of each agent are, as changes (W, N, D) of entries tell: `other0.dx` changes by as much as
+    that other's `own.x` less one's own. `how` has the entries: (the own one, which other it is about). None where the
+    others may be the team in order, and where their order does not stay."""
+    about = [(entry, own, other) for entry, (own, other) in how.items() if other >= 0]
+    usual = others(change.shape[1], 1 + max((other for *_, other in about), default=-1))
+    order = usual.copy()
+    for agent, place in np.ndindex(*order.shape):
+        told = [(entry, own) for entry, own, other in about if other == place]
+        if _off(change, agent, told, [int(usual[agent, place])]).min() <= OFF:
+            continue
+        off = _off(change, agent, told, range(change.shape[1]))
+        order[agent, place] = off.argmin()
+        if off.min() > OFF:
+            return None
+    stays = all(len(set(row)) == len(row) for row in order.tolist())
+    return order if stays and (order != usual).any() else None
+
+
+def _off(change: np.ndarray, agent: int, told: Iterable[tuple[int, int]], who: Iterable[int]) -> np.ndarray:
+    """(len(who),) by what share of its change the entry that tells best is off, if it is about each of these."""
+    who = list(who)
+    least = np.full(len(who), np.inf)
+    for entry, own in told:
+        mine = change[:, agent, entry]
+        size = np.quantile(np.abs(mine), SHARE)
+        wrong = np.quantile(np.abs((mine + change[:, agent, own])[:, None] - change[:, who, own]), SHARE, axis=0)
+        least = np.minimum(least, np.where(size > LEAST, wrong / max(size, LEAST), np.inf))
+    return np.where(np.array(who) == agent, np.inf, least)
 
 
 class Mirrored(NamedTuple):

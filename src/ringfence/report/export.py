@@ -14,7 +14,7 @@ from ringfence.report.board import Board, read
 from ringfence.report.board_page import rankings, short
 from ringfence.report.html import share
 from ringfence.report.table import Line, Method
-from ringfence.utils.escape import latex, markdown, spreadsheet
+from ringfence.utils.text import latex, markdown, spreadsheet
 
 # What CSV says of a line that was measured; intervals and the bound are 95 %, numbers per episode.
 NUMBERS: dict[str, Callable[[Line], Any]] = {

@@ -9,8 +9,8 @@ import jinja2
 from markupsafe import Markup
 
 from ringfence import __version__
-from ringfence.utils.escape import page
 from ringfence.utils.files import whole, writable
+from ringfence.utils.text import page
 
 HERE = Path(__file__).parent
 

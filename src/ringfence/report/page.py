@@ -16,7 +16,7 @@ from ringfence.datasets.task import Task
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.evaluation.table import Row
-from ringfence.logs.provenance import regenerated
+from ringfence.logs.schema import regenerated
 from ringfence.problem import constraints
 from ringfence.report import barrier, figures, html, player, provenance
 from ringfence.report.headline import danger, headline, words_of

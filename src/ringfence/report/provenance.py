@@ -10,11 +10,11 @@ from typing import Any
 from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.errors import UserError, whole_number
-from ringfence.logs.provenance import regenerated
+from ringfence.logs.schema import regenerated
 from ringfence.report.table import Section, settings_of
 from ringfence.training.runs import Run
 from ringfence.utils import schemas
-from ringfence.utils.escape import shell
+from ringfence.utils.text import shell
 
 THEIRS = "THEIR.py:SIMULATOR"
 LONGEST = 400  # letters of a fact; the file itself lies in the run folder

@@ -1,6 +1,6 @@
 """Episodes as small animated pictures, drawn without a display: EGL or OSMesa on Linux, what the system has elsewhere.
 
-A simulator that has `frames` draws them (envs/film.py, envs/discs.py). MuJoCo decides how to draw when it is imported,
+A simulator that has `frames` draws them (envs/film.py). MuJoCo decides how to draw when it is imported,
 so drawing happens in a process of its own.
 """
 

@@ -24,8 +24,8 @@ import numpy as np
 from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.errors import CheckpointError, RunConflict, UserError, of_kind, unknown, whole_number
-from ringfence.logs.provenance import other_data
 from ringfence.logs.resolution import require_resolved
+from ringfence.logs.schema import other_data
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, draw
 from ringfence.training import worlds

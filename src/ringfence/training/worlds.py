@@ -18,9 +18,8 @@ from ringfence.datasets.make import make
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, NoWorld, UserError, whole_number
 from ringfence.guards.searched import false_safe
-from ringfence.logs.provenance import regenerated
 from ringfence.logs.resolution import require_resolved
-from ringfence.logs.schema import StoreCard, complete_card
+from ringfence.logs.schema import StoreCard, complete_card, regenerated
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.problem.origins import Origins

@@ -15,6 +15,7 @@ import hashlib
 import logging
 import os
 import platform
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from typing import Any
 import jax
 
 from ringfence.errors import UserError
-from ringfence.utils.cache import cache_dir
+from ringfence.utils.files import cache_dir
 
 VARIABLE = "RINGFENCE_COMPILATION_CACHE"
 # JAX's options: what they are by default, and here. What was not used for longest goes first. JAX looks through
@@ -52,7 +53,11 @@ def keep_programs() -> Path | None:
         if _option(name) == usual:  # else the user has chosen
             jax.config.update(f"jax_{name}", ours)
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    _begin_again()
+    with suppress(ImportError, AttributeError):  # of a later version: it counts from the next process's first program
+        from jax.experimental.compilation_cache import compilation_cache
+
+        # JAX looks at its settings once, at the first program; one may have been compiled already.
+        compilation_cache.reset_cache()
     return folder
 
 
@@ -90,13 +95,3 @@ def _machine() -> str:
         pass
     words = " ".join(sorted(flags.split()))
     return hashlib.blake2b(f"{platform.machine()} {words}".encode(), digest_size=6).hexdigest()
-
-
-def _begin_again() -> None:
-    """JAX looks at its settings once, at the first program; one may have been compiled already."""
-    try:
-        from jax.experimental.compilation_cache import compilation_cache
-
-        compilation_cache.reset_cache()
-    except (ImportError, AttributeError):  # a later version: it counts from the next process's first program
-        pass

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -95,7 +96,8 @@ def refuse_out_of_bounds(field: Field, value: Any, of: str = "") -> None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     bounds = field.bounds or Meta()
-    if abs(value) < LARGEST and _inside(value, bounds):
+    limits = (bounds.ge, operator.ge), (bounds.gt, operator.gt), (bounds.le, operator.le), (bounds.lt, operator.lt)
+    if abs(value) < LARGEST and all(limit is None or holds(value, limit) for limit, holds in limits):
         return
     owner = f" of {of}" if of else ""
     raise UserError(f"{field.name}={value}{owner} must {bounds.description or _in_words(value, bounds)}.")
@@ -121,15 +123,6 @@ def _of_type(field: Field, value: Any, of: str) -> Any:
         wanted = " or ".join(words for kind, words in KINDS.items() if kind in field.kinds)
         raise UserError(f"{field.name}={value!r} of {of} must be {wanted}.")
     return value
-
-
-def _inside(value: float, bounds: Meta) -> bool:
-    return (
-        (bounds.ge is None or value >= bounds.ge)
-        and (bounds.gt is None or value > bounds.gt)
-        and (bounds.le is None or value <= bounds.le)
-        and (bounds.lt is None or value < bounds.lt)
-    )
 
 
 def _in_words(value: float, bounds: Meta) -> str:

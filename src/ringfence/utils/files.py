@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; a folder belongs to one process at a time."""
+"""Files appear whole or not at all; a folder belongs to one process at a time. What can be made again has its place."""
 
 from __future__ import annotations
 
@@ -13,15 +13,36 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+import platformdirs
 from filelock import FileLock
 
 from ringfence.errors import UserError, reading
 from ringfence.utils import interrupts
-from ringfence.utils.cache import elsewhere
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
 LONGEST = 200  # bytes of a name: what is written beside it has a longer one
 LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
+
+
+def cache_dir() -> Path:
+    """$RINGFENCE_HOME, else the user's cache folder."""
+    if home := os.environ.get("RINGFENCE_HOME"):
+        return Path(home)
+    try:
+        found = platformdirs.user_cache_path("ringfence", appauthor=False)
+    except RuntimeError:
+        found = Path("~")  # as older versions leave it where nobody knows the user's home
+    if not found.is_absolute():
+        raise UserError("This user has no home folder to keep data in; set RINGFENCE_HOME to a folder.")
+    return found
+
+
+def elsewhere(path: Path) -> str:
+    """What helps where a file cannot be written: who chose its place chooses another."""
+    with suppress(UserError):
+        if path.absolute().is_relative_to(cache_dir().absolute()):
+            return "set RINGFENCE_HOME to another folder"
+    return "choose another place"
 
 
 @contextmanager
@@ -36,7 +57,10 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(path)
+        for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):  # whose writers may be gone
+            writer = part.name.removesuffix(".part").rpartition(".")[2]
+            if writer.isdigit() and not _alive(int(writer)):
+                _remove(part)
         interrupts.unfinished.add(temporary)
         temporary.touch()
         mode = temporary.stat().st_mode & 0o777  # the umask itself can only be read by changing it for all threads
@@ -110,14 +134,6 @@ def within(folder: str | os.PathLike, path: str | os.PathLike) -> Path:
     if not Path(path).resolve().is_relative_to(Path(folder).resolve()):
         raise ValueError(f"it is a link out of '{folder}'")
     return Path(path)
-
-
-def _sweep(path: Path) -> None:
-    """Remove parts of this file whose writers are gone."""
-    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        writer = part.name.removesuffix(".part").rpartition(".")[2]
-        if writer.isdigit() and not _alive(int(writer)):
-            _remove(part)
 
 
 def _alive(process: int) -> bool:

@@ -4,21 +4,40 @@ A program that sets JAX_ENABLE_X64 for code of its own gets the same numbers as 
 called back (simulators, policies under guard), run in its own precision.
 
 Products of matrices are of 32 bits, too: on a GPU, JAX would else keep 10 bits of what they multiply (TF32), and bounds
-that are proven would not hold.
+that are proven would not hold. Arrays of the host come to the device so, too.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import ParamSpec, TypeVar
 
 import jax
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
-from ringfence.utils.forks import refuse_forked
+from ringfence.errors import UserError
+from ringfence.types import Array
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+_at_work: int | None = None  # the process that JAX works in
+
+
+def refuse_forked() -> None:
+    """Refuse to work in a process that was forked from one in which JAX had worked for this package."""
+    global _at_work
+    process = os.getpid()
+    if _at_work not in (None, process):
+        raise UserError(
+            "This process was forked from one that JAX had worked in, and would wait for its threads for ever; start "
+            'it with multiprocessing.get_context("spawn"), or use threads.'
+        )
+    _at_work = process
 
 
 @contextmanager
@@ -45,3 +64,8 @@ def float64() -> AbstractContextManager[object]:
 def in_float32(function: Callable[P, T]) -> Callable[P, T]:
     """The function, in 32 bits."""
     return float32()(function)
+
+
+def on_device(x: ArrayLike, dtype: DTypeLike | None = None) -> Array:
+    """The array on the device, of 32 bits; `jnp.asarray` compiles a program for every shape that it is given."""
+    return jax.device_put(np.asarray(x, dtype))

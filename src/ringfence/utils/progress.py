@@ -142,9 +142,7 @@ class Parts(Progress):
         spent = time.monotonic() - self.started
         pace = (spent + TRUST) / (done + TRUST)  # seconds of these for one that was expected
         self.done = round(100 * done / max(done + rest, 1e-9))
-        self.note = f"{self.now}, about {_in_words(pace * rest)} left" if rest else ""
+        left = pace * rest
+        words = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
+        self.note = f"{self.now}, about {words} left" if rest else ""
         super()._show(at_once)
-
-
-def _in_words(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -33,7 +33,7 @@ from ringfence.problem.constraints import lowest
 from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world.cause_nets import Labelled, Score, blank, scores, worst
 from ringfence.world.causes import Found
 from ringfence.world.settings import Settings

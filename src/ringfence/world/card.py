@@ -11,7 +11,7 @@ import msgspec
 
 from ringfence.errors import plain
 from ringfence.utils.config import build_config
-from ringfence.utils.numbers import percent, significant
+from ringfence.utils.text import percent, significant
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.settings import Settings
 

@@ -22,7 +22,7 @@ from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found
 from ringfence.world.settings import Settings
 

@@ -24,11 +24,11 @@ from ringfence.nets.optim import regress
 from ringfence.problem import partners
 from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
+from ringfence.problem.motion import pointing, within
 from ringfence.problem.normalise import varying
-from ringfence.problem.others import others
-from ringfence.problem.turns import pointing, within
+from ringfence.problem.partners import others
 from ringfence.types import Array, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world.settings import Settings
 
 AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of

@@ -25,9 +25,8 @@ from ringfence.logs.store import EpisodeStore, team
 from ringfence.problem import constraints, features
 from ringfence.problem.normalise import varying
 from ringfence.types import Key, Spec
-from ringfence.utils.cache import cache_dir
-from ringfence.utils.device import on_device
-from ringfence.utils.files import whole
+from ringfence.utils.files import cache_dir, whole
+from ringfence.utils.precision import on_device
 from ringfence.utils.progress import Parts
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ringfence.logs.store import EpisodeStore
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 from ringfence.world.margins import entries

@@ -17,7 +17,7 @@ from ringfence.problem.constraints import lowest
 from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world import cause_candidates, probes
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import (

@@ -15,7 +15,7 @@ from ringfence.logs.windows import WindowData, returns_to_go
 from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.settings import Settings
 

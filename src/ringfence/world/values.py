@@ -22,7 +22,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import team_mean
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world.settings import Settings
 
 ROWS = 100_000  # states evaluated at once

@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.datasets.behaviour import gather, rollout
-from ringfence.datasets.recipes import COLLECTION
+from ringfence.datasets.recipes import COLLECTION, RECIPES
 from ringfence.datasets.task import Card, Recipe, Task
-from ringfence.datasets.version import RECIPES
 from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, TURN, Crossing, CrossingState, length
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore

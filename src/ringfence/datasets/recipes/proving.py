@@ -9,9 +9,8 @@ import equinox as eqx
 import jax
 
 from ringfence.datasets.behaviour import gather, logged
-from ringfence.datasets.recipes import COLLECTION
+from ringfence.datasets.recipes import COLLECTION, RECIPES
 from ringfence.datasets.task import Card, Recipe, Task
-from ringfence.datasets.version import RECIPES
 from ringfence.envs.proving import System, drivers
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore

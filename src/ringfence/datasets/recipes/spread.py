@@ -1,5 +1,5 @@
 """Simple Spread's data sets, as OMAR describes the public ones: MATD3 at two levels, its replay, random actions; of one
-learner, or pooled of five, as most of the literature reads the public ones."""
+learner, or pooled of five, as most of the literature reads the public ones; and in the views of each agent."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import jax
 import numpy as np
 
 from ringfence.datasets import behaviour as policies
-from ringfence.datasets import replay
-from ringfence.datasets.recipes import COLLECTION
+from ringfence.datasets.recipes import COLLECTION, RECIPES
 from ringfence.datasets.task import Card, Recipe, Task
-from ringfence.datasets.version import RECIPES
-from ringfence.envs.simple_spread import SimpleSpread
+from ringfence.envs.simple_spread import LANDMARKS, OTHERS, SIGHT, SimpleSpread, SpreadAlike, touching
+from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 
 POOLED = "-pooled"  # ends the names of tiers of five learners
+CHUNK = 2000  # episodes whose views are computed at once
 TURNS = "its number in the full set modulo 5"
 
 
@@ -70,7 +70,7 @@ def played(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict
     """A tier's episodes (E, L, ...), and by whom, in words."""
     if tier == "medium-replay":
         how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
-        return replay.replay_episodes(env, episodes, seed), how
+        return policies.replay_episodes(env, episodes, seed), how
     key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
     if tier in policies.LEVELS:
         policy = policies.shipped_policy(tier)
@@ -95,9 +95,9 @@ def pooled(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict
 def _of_lineage(env: SimpleSpread, tier: str, episodes: int, seed: int, lineage: int) -> dict[str, np.ndarray]:
     """One learner's share of a pooled tier."""
     if tier == "medium-replay" and seed == 0:
-        return replay.shipped_replay(env, episodes, lineage)
+        return policies.shipped_replay(env, episodes, lineage)
     if tier == "medium-replay":
-        return replay.replay_episodes(env, episodes, policies.LINEAGES * seed + lineage)
+        return policies.replay_episodes(env, episodes, policies.LINEAGES * seed + lineage)
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(COLLECTION), seed), lineage)
     policy = policies.shipped_policy(tier, lineage=lineage) if tier in policies.LEVELS else "random"
     return policies.collect(env, policy, episodes, key)
@@ -108,4 +108,38 @@ def _env(task: Task) -> SimpleSpread:
     return task.env
 
 
+def about_alike(task: Task) -> Card:
+    """The simulator as each agent sees it, for the card."""
+    seen = f"{LANDMARKS} landmarks and {OTHERS} others seen within {SIGHT:g} m"
+    return {"simulator": f"ringfence {RECIPES} simple_spread, {seen}"}
+
+
+def collect_alike(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:
+    """The same play of three in their own views: observations (E, L+1, N, O), costs (E, L, N) of arriving there."""
+    env = task.env
+    assert isinstance(env, SpreadAlike), "only tasks of SpreadAlike name this recipe"
+    if env.n_agents != 3:
+        raise UserError(f"'{task.name}' was played by 3, so agents={env.n_agents} have no data; train with 3.")
+    whole, how = played(env.whole, task.tier, transitions // env.episode_length, seed)
+
+    @jax.jit
+    def view(flat: Array) -> tuple[Array, Array]:
+        state = env.from_global_state(flat)
+        return env.observe(state), touching(state)[:, 1:]
+
+    states = whole["state"]
+    parts = [view(states[k : k + CHUNK]) for k in range(0, len(states), CHUNK)]
+    observations, costs = (np.concatenate([np.asarray(part) for part in both]) for both in zip(*parts))
+    card = card | {
+        "transitions": transitions,
+        "collected": f"{how}, in the views of each agent",
+        "observation_names": list(env.observation_names),
+    }
+    return EpisodeStore.from_episodes(
+        observations, whole["actions"], whole["rewards"], costs, state=whole["state"], card=card
+    )
+
+
 RECIPE = Recipe(about=about, collect=collect, references=references)
+# no reference: who collected the data sees everything, in a team of three
+ALIKE = Recipe(about=about_alike, collect=collect_alike)

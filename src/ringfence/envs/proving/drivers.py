@@ -16,10 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.proving import observations
 from ringfence.envs.proving.bodies import Motion, length
 from ringfence.envs.proving.dangers import FAR, LOW_CHARGE
-from ringfence.envs.proving.layout import Drivers, Layout, SystemState
+from ringfence.envs.proving.layout import Drivers, Layout, SystemState, read
 from ringfence.types import Array, Key
 
 ROUNDS = 6  # in each of which the barrier that is missed most is met
@@ -84,7 +83,7 @@ def drive(system: Layout, state: SystemState, habit: Habit, key: Key, looks: Arr
 
 def naive(system: Layout, observation: Array) -> Array:
     """Actions (..., N, A) of who heads straight for its goal at full speed, from what it observes."""
-    motion, ahead = observations.read(system, observation)
+    motion, ahead = read(system, observation)
     want = towards(system, ahead, 1.0)
     free = jnp.full(want.shape[:-1], jnp.inf)
     n = observation.shape[-2]  # one, of homogeneous agents who are each by themselves

@@ -16,7 +16,7 @@ from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 
 WIDTH = 64  # units of each of the 2 hidden layers
 BEYOND = 0.5  # of the range that values can have: estimates further outside have diverged

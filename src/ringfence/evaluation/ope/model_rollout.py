@@ -19,7 +19,7 @@ from ringfence.guards import BarrierSource
 from ringfence.problem import normalise
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world import World
 
 EXACT = 0.01  # deviations by which an entry may be missed, root mean square

@@ -15,7 +15,7 @@ from ringfence.guards.policy import Guarded
 from ringfence.problem import normalise
 from ringfence.proposals.base import held, in_bounds_of
 from ringfence.types import Array, Key, Proposes, PyTree
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.world import World
 
 BATCH = 512  # states that a policy is asked in together

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from ringfence.utils.numbers import percent
+from ringfence.utils.text import percent
 
 
 @dataclass(frozen=True)

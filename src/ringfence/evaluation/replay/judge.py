@@ -29,8 +29,8 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.logs.late import Lateness
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.problem.entries import Names
 from ringfence.problem.features import given_names
-from ringfence.problem.names import Names
 from ringfence.training.runs import Run
 from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs

@@ -10,10 +10,9 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import on_map
-from ringfence.problem.entries import HEADINGS, SPEEDS
-from ringfence.problem.kinematics import late_share
-from ringfence.problem.names import Names
-from ringfence.problem.others import others
+from ringfence.problem.entries import HEADINGS, SPEEDS, Names
+from ringfence.problem.motion import late_share
+from ringfence.problem.partners import others
 
 EXACT = 1e-4  # of how far a team is apart: what is rounded is off by less
 NOBODY = 1e6  # m: how far away is who is not there

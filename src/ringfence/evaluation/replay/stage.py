@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.base import Outcome, Seed, Seen
-from ringfence.envs.rollout import Memoryless, Moment, rollout, split_off
+from ringfence.envs.base import Memoryless, Moment, Outcome, Seed, Seen, rollout, split_off
 from ringfence.errors import UserError
 from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit
@@ -23,7 +22,7 @@ from ringfence.guards import Guard
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import held
 from ringfence.types import Array, Policy, PolicyStep, PyTree
-from ringfence.utils.device import on_device
+from ringfence.utils.precision import on_device
 from ringfence.utils.progress import Progress
 from ringfence.world import World
 

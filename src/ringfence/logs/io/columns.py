@@ -160,7 +160,11 @@ def numbers(columns: Columns, name: str) -> np.ndarray:
         raise StoreError(f"row 0: {name} is {str(column[0])[:40]!r}, no number; {remedy}.")
     row = None
     if column.dtype.kind == "O":
-        others = [k for k, entry in enumerate(column) if not _is_number(entry)]
+        others = [
+            k
+            for k, entry in enumerate(column)
+            if not isinstance(entry, Number) or isinstance(entry, complex | np.complexfloating) or not _converts(entry)
+        ]
         # One word makes text of a whole column of a file; the row to repair is its own.
         words = (k for k in others if not (isinstance(column[k], str) and _converts(column[k])))
         row = next(words, others[0] if others else None)
@@ -338,9 +342,15 @@ def _or(kinds: Iterable[str]) -> str:
 
 
 def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
-    """Columns of a text or Parquet file."""
+    """Columns of a Parquet file, or of text, separated by what separates the first line; by spaces only where the form
+    names the columns."""
     needs("pyarrow")
-    table = None if path.suffix.lower() in PARQUET else _read_csv(path, form)
+    from pyarrow import csv
+
+    table = None
+    if path.suffix.lower() not in PARQUET:
+        source, options = _of_csv(path, form)
+        table = csv.read_csv(source, **options)
     names = names_in(path) if table is None else table.column_names
     twice = [name for name, times in Counter(names).items() if times > 1]
     if twice:
@@ -349,14 +359,6 @@ def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
         return dict.fromkeys(names, np.zeros(0))
     known(wanted, names)
     return read_parquet([path], wanted) if table is None else {name: table.column(name).to_numpy() for name in wanted}
-
-
-def _read_csv(path: Path, form: Form) -> Any:
-    """An Arrow table, separated by what separates the first line; by spaces only where the form names the columns."""
-    from pyarrow import csv
-
-    source, options = _of_csv(path, form)
-    return csv.read_csv(source, **options)
 
 
 def _of_csv(
@@ -387,10 +389,6 @@ def _of_csv(
             include_columns=wanted,
         ),
     }
-
-
-def _is_number(entry: Any) -> bool:
-    return isinstance(entry, Number) and not isinstance(entry, complex | np.complexfloating) and _converts(entry)
 
 
 def _converts(entry: Any) -> bool:

@@ -12,7 +12,7 @@ from ringfence.errors import StoreError
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Tracks, cut, is_first, nearest, teams
 from ringfence.problem.entries import SPACE
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 
 RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in SPACE)
 BLOCK = 2**22  # entries of observations that are made at once
@@ -141,15 +141,32 @@ class Episodes:
 
 def team_episodes(motion: Motion) -> Episodes:
     """Episodes of a constant team, of which everybody sees all others."""
-    rows, lengths, short = _team_windows(motion)
+    schema, tracks = motion.schema, motion.tracks
+    rows, there, n = teams(tracks, schema.team)
+    rows = _in_place(motion, rows, there)
+    index, lengths = cut(there, schema.min_episode_steps, schema.max_episode_steps)
+    if not len(lengths):
+        here = np.unique(tracks.agent).size
+        raise StoreError(
+            f"No {n} agents are together for {schema.min_episode_steps} steps of {tracks.dt:g} s (the table has "
+            f"{here}); give another team, a smaller min_episode_steps, a longer gap, or neighbours."
+        )
+    short = _too_short(motion, rows, there, index, len(lengths))
+    rows = rows[index]
     entries = motion.own(with_place=True)
-    columns = _of_others(motion)
+    # of another agent: those of RELATIVE relative to oneself, the rest as they are
+    columns = {f"d{axis}": motion.column(axis) for axis in schema.position}
+    columns |= {f"dv{axis}": motion.velocity[:, k] for k, axis in enumerate(schema.axes)}
+    known = (*schema.position, *schema.velocity)
+    columns |= {name: motion.column(name) for name in schema.state if name not in known}
     _refuse_large(motion, rows.size, len(entries) + (rows.shape[1] - 1) * len(columns))
     for j, whose in enumerate(others(rows.shape[1]).T):
         entries += [Entry(f"other{j}.{name}", column, whose, name in RELATIVE) for name, column in columns.items()]
-    cost = motion.tracks.cost[rows]
-    if motion.schema.separation is not None:
-        cost = _too_close(motion.place[rows], motion.schema.separation.radius)
+    cost = tracks.cost[rows]
+    if schema.separation is not None:  # 1 where the nearest other is closer than the radius
+        place = motion.place[rows]
+        distance = np.linalg.norm(place[:, None] - place[:, :, None], axis=-1) + 1e9 * np.eye(place.shape[1])
+        cost = (distance.min(-1) < schema.separation.radius).astype(float)[..., None]
     members, changes = _members(motion, rows)
     return Episodes(rows, lengths, entries, cost, (*short, *_left_out(motion, rows), *changes), agents=members)
 
@@ -199,22 +216,6 @@ def _in_place(motion: Motion, rows: np.ndarray, there: np.ndarray) -> np.ndarray
     return np.take_along_axis(rows, np.repeat(order, there, 0), 1)
 
 
-def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Rows (W, N) of windows in which a team is there, how many rows each has, and what is said of those that are too
-    short."""
-    schema = motion.schema
-    rows, there, n = teams(motion.tracks, schema.team)
-    rows = _in_place(motion, rows, there)
-    index, lengths = cut(there, schema.min_episode_steps, schema.max_episode_steps)
-    if not len(lengths):
-        here = np.unique(motion.tracks.agent).size
-        raise StoreError(
-            f"No {n} agents are together for {schema.min_episode_steps} steps of {motion.tracks.dt:g} s (the table has "
-            f"{here}); give another team, a smaller min_episode_steps, a longer gap, or neighbours."
-        )
-    return rows[index], lengths, _too_short(motion, rows, there, index, len(lengths))
-
-
 def _too_short(
     motion: Motion, rows: np.ndarray, there: np.ndarray, index: np.ndarray, episodes: int
 ) -> tuple[str, ...]:
@@ -236,22 +237,6 @@ def _too_short(
         with_cost = len(np.unique(np.cumsum(begins)[left][costly]))
         said += f", {with_cost or 'none'} of them with a cost"
     return (said,)
-
-
-def _of_others(motion: Motion) -> dict[str, np.ndarray]:
-    """(R,) columns of what is seen of another agent: those of RELATIVE relative to oneself, the rest as they are."""
-    schema = motion.schema
-    columns = {f"d{axis}": motion.column(axis) for axis in schema.position}
-    columns |= {f"dv{axis}": motion.velocity[:, k] for k, axis in enumerate(schema.axes)}
-    known = (*schema.position, *schema.velocity)
-    return columns | {name: motion.column(name) for name in schema.state if name not in known}
-
-
-def _too_close(place: np.ndarray, radius: float) -> np.ndarray:
-    """(W, N, 1) costs of places (W, N, axes): 1 where the nearest other is closer than the radius."""
-    n = place.shape[1]
-    distance = np.linalg.norm(place[:, None] - place[:, :, None], axis=-1) + 1e9 * np.eye(n)
-    return (distance.min(-1) < radius).astype(float)[..., None]
 
 
 def _left_out(motion: Motion, rows: np.ndarray) -> tuple[str, ...]:

@@ -203,7 +203,12 @@ def read_obsmat(path: Path) -> dict[str, np.ndarray]:
         )
     columns = dict(zip(OBSMAT, rows.T))
     frame, agent = columns["frame"], columns["agent"]
-    time = frame * SPACING / _frames_between_lines(path, frame, agent)
+    order = np.lexsort((frame, agent))
+    apart = np.diff(frame[order])[np.diff(agent[order]) == 0]
+    apart = apart[apart > 0]
+    if not len(apart):
+        raise StoreError(f"'{path}' has no pedestrian at two frames; give lines of {' '.join(OBSMAT)}.")
+    time = frame * SPACING / float(np.median(apart))
     if not (np.isfinite(agent) & (agent == np.round(agent))).all():
         raise StoreError(f"'{path}' numbers a pedestrian otherwise than by whole numbers; give {' '.join(OBSMAT)}.")
     return {
@@ -211,15 +216,6 @@ def read_obsmat(path: Path) -> dict[str, np.ndarray]:
         "agent": agent.astype(np.int64),
         **{name: columns[name] for name in ("x", "y", "vx", "vy")},
     }
-
-
-def _frames_between_lines(path: Path, frame: np.ndarray, agent: np.ndarray) -> float:
-    order = np.lexsort((frame, agent))
-    apart = np.diff(frame[order])[np.diff(agent[order]) == 0]
-    apart = apart[apart > 0]
-    if not len(apart):
-        raise StoreError(f"'{path}' has no pedestrian at two frames; give lines of {' '.join(OBSMAT)}.")
-    return float(np.median(apart))
 
 
 # --- SUMO ---

@@ -18,7 +18,7 @@ from ringfence.errors import StoreError, UserError, one_of, reading
 from ringfence.logs.io.columns import Columns, Table, by_entry, known, needs, numbers, stacked
 from ringfence.logs.io.formats import names_in, read_parquet
 from ringfence.utils import schemas
-from ringfence.utils.natural import natural
+from ringfence.utils.text import natural
 
 INFO = "meta/info.json"
 LARGEST = 2**24  # bytes of meta/info.json
@@ -55,16 +55,21 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward])
     single = {name: next(iter(_entries(name, read[name], None).values())) for name in read if name not in wanted}
     own = {name: _entries(name, read[name], info.names[name]) for name in wanted}
-    states = _joined(own, state)
+    states = dict(own[state[0]]) if state else {}
+    for name in state[1:]:  # entries of another column (`observation.velocity`) say whose they are
+        states |= {f"{name.rpartition('.')[2]}.{entry}": column for entry, column in own[name].items()}
     actions = own[ACTION]
     agents = _agents(arms, list(actions))
+    frames = len(read["frame_index"])
     columns = {
         "time": numbers(single, "frame_index") / info.fps,
         "episode": single["episode_index"],
-        **({"reward": _arriving(numbers(single, REWARD), single["episode_index"])} if reward else {}),
     }
+    if reward:  # what a frame's action earned, in the frame in which it arrived
+        columns["reward"] = np.zeros(frames)
+        follows = np.diff(single["episode_index"]) == 0
+        columns["reward"][1:][follows] = numbers(single, REWARD)[:-1][follows]
     table, names = _by_agent(columns, agents, states, actions)
-    frames = len(read["frame_index"])
     missing = frames != info.frames
     notes = [f"{INFO} counts {info.frames} frames, {frames} are here"] if missing else []
     return LeRobotTable(table, *names, "reward" if reward else None, tuple(agents), 1 / info.fps, tuple(notes))
@@ -141,23 +146,6 @@ def _entries(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
     """A column of lists by the names of its entries; numbers are lists of one."""
     rows = stacked(name, column)
     return by_entry(name, column[:, None] if rows is None else rows, names)
-
-
-def _joined(own: Mapping[str, Columns], state: Sequence[str]) -> Columns:
-    """Entries of all columns of the state; those of a second one (`observation.velocity`) say whose they are."""
-    found: Columns = {}
-    for name in state:
-        before = "" if name == state[0] else f"{name.rpartition('.')[2]}."
-        found |= {before + entry: column for entry, column in own[name].items()}
-    return found
-
-
-def _arriving(reward: np.ndarray, episode: np.ndarray) -> np.ndarray:
-    """(M,) of `next.reward`, which a frame's action earned, that of the frame in which it arrived."""
-    earned = np.zeros(len(episode))
-    follows = episode[1:] == episode[:-1]
-    earned[1:][follows] = reward[:-1][follows]
-    return earned
 
 
 # --- agents ---

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError, of_kind
+from ringfence.logs.io.rows import angle_of
 from ringfence.logs.io.tracks import Tracks, nearest
-from ringfence.logs.io.units import angle_of
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import SPACE, Entries, Entry
-from ringfence.problem.others import others
+from ringfence.problem.partners import others
 from ringfence.utils.given import given_as, refuse_other_order
 
 
@@ -81,16 +81,14 @@ class _Now:
             return self.columns[what]
         if whose == "other" and order is not None and (what == "seen" or column in self.columns):
             who = self.others[:, order]
-            return (who >= 0).astype(float) if what == "seen" else self._of_other(who, column, relative)
+            if what == "seen":
+                return (who >= 0).astype(float)
+            own = self.columns[column]
+            theirs = own[who] - own if relative else own[who]
+            first_axis = next((axis for axis in SPACE if axis in self.columns), None)
+            # nobody is as far along the first axis as one senses
+            return np.where(who >= 0, theirs, self.sensing_radius if column == first_axis else 0.0)
         raise UserError(f"The logs observe '{name}', which state and goal do not tell; add it.")
-
-    def _of_other(self, who: np.ndarray, column: str, relative: bool) -> np.ndarray:
-        """(N,) the others' column; nobody is as far along the first axis as one senses."""
-        own = self.columns[column]
-        theirs = own[who] - own if relative else own[who]
-        first_axis = next((axis for axis in SPACE if axis in self.columns), None)
-        return np.where(who >= 0, theirs, self.sensing_radius if column == first_axis else 0.0)
-
 
 def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots: int) -> np.ndarray:
     """(N, slots) whom each agent sees."""

@@ -86,7 +86,15 @@ def read_vault(vault: Path, env: SafeMuJoCo) -> dict[str, Any]:
             )
     sequences, steps = arrays["actions"].shape[:2]
     _check_shape(where, "actions", arrays["actions"], (sequences, steps, env.n_agents, env.action_dim))
-    states = _vault_states(where, env, arrays["infos.state"])
+    states = arrays["infos.state"]
+    if states.ndim == 4:
+        states = states[:, :, 0]  # some copies repeat them for every agent
+    known = (27, 105, 111) if env.ant else (17,)
+    if states.ndim != 3 or states.shape[-1] not in known:
+        raise StoreError(
+            f"{where} has states of {states.shape[-1]} entries; known layouts of {env.name} have "
+            f"{', '.join(map(str, known))} (positions but the planar place, velocities, contact forces)."
+        )
     width = len(env.state_names)
     for name in ("rewards", "terminals", "truncations"):  # of every agent, or of the team
         if arrays[name].ndim == 2:
@@ -111,19 +119,6 @@ def read_vault(vault: Path, env: SafeMuJoCo) -> dict[str, Any]:
     if unended:
         notes.append(f"{unended} episodes at the end of a recording have no end of their own and count as cut off")
     return _steps(log, env, f"imported from an OG-MARL Vault, '{vault}'", notes)
-
-
-def _vault_states(where: str, env: SafeMuJoCo, states: np.ndarray) -> np.ndarray:
-    """(B, T, S and contact forces); a layout that nobody knows is refused."""
-    if states.ndim == 4:
-        states = states[:, :, 0]  # some copies repeat them for every agent
-    known = (27, 105, 111) if env.ant else (17,)
-    if states.ndim != 3 or states.shape[-1] not in known:
-        raise StoreError(
-            f"{where} has states of {states.shape[-1]} entries; known layouts of {env.name} have "
-            f"{', '.join(map(str, known))} (positions but the planar place, velocities, contact forces)."
-        )
-    return states
 
 
 def read_madiff(directory: Path, env: SafeMuJoCo) -> dict[str, Any]:
@@ -180,7 +175,10 @@ def _steps(log: StateLog | ObservationLog, env: SafeMuJoCo, provenance: str, not
         names, fast = list(env.observation_names), ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)
     else:
         steps, speed, simulator = _from_observations(log, env, ends, notes)
-        names, fast = _old_names(log.observations.shape[2], env), ("torso.vx",)
+        near = env.n_agents - 1 if env.parts == "4x2" else 2
+        own = log.observations.shape[2] - near - 2
+        names = [f"own{k}" for k in range(own)] + [f"near{k}.q" for k in range(near)] + ["torso.vx", "torso.x"]
+        fast = ("torso.vx",)
     short = int((np.diff(ends, prepend=0) < env.episode_length).sum() - steps["terminated"].sum())
     if env.ant and short:
         notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
@@ -259,7 +257,9 @@ def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[s
     notes.append(
         f"what the last action of every episode led to is not recorded: it was replayed in the simulator{falls}"
     )
-    unpaid = _unpaid_falls(outcome, rewards[at])
+    # Gymnasium's version 5 does not pay the 1 for standing on the step that falls: its reward tells 1 m/s too little.
+    missing = outcome.reward - rewards[at]
+    unpaid = outcome.terminated & (np.abs(missing - 1.0) < np.abs(missing))
     vx[at[unpaid]] += 1.0
     if unpaid.any():
         notes.append(f"{int(unpaid.sum())} falls were not paid the 1 for standing; their speed is corrected")
@@ -283,13 +283,6 @@ def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[s
         "final_state": final_state,
     }
     return steps, speed, "gymnasium-robotics, version not recorded" if newer else RECORDED_WITH
-
-
-def _unpaid_falls(outcome: Outcome, rewards: np.ndarray) -> np.ndarray:
-    """(E,) bool. Gymnasium's version 5 does not pay the 1 for standing on the step that falls: its reward tells 1 m/s
-    too little."""
-    missing = outcome.reward - rewards
-    return outcome.terminated & (np.abs(missing - 1.0) < np.abs(missing))
 
 
 def _from_observations(log: ObservationLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Made:
@@ -343,22 +336,8 @@ def _replay(
         errors[name] = np.abs(after - log.state[steps + 1]).max(1)
         rewards[name] = outcome.reward
     best, other = sorted(errors, key=lambda name: float(np.median(errors[name])))
-    _check_replay(log, steps, errors[best])
-    wanted = _earned_by_running(env, rewards[best], actions[steps])
-    vx, speed_note = _checked_speed(log, env, len(actions), steps, wanted)
+    miss = float(np.median(errors[best]))
     astray = errors[best] > STRAY
-    notes.append(
-        f"actions are {best}: a replayed step misses by {np.median(errors[best]):.2g} in the median, in the other "
-        f"order by {np.median(errors[other]):.2g}; {100 * astray.mean():.2g} % miss by more than {STRAY:g}"
-    )
-    notes.append(speed_note)
-    return orders[best], vx
-
-
-def _check_replay(log: StateLog, steps: np.ndarray, errors: np.ndarray) -> None:
-    """Refuse states that the simulator does not reproduce: largest errors (K,) of replayed steps (K,)."""
-    miss = float(np.median(errors))
-    astray = errors > STRAY
     if miss > AGREES:
         raise StoreError(
             f"{log.where} is not this robot's: one step in the simulator misses the recorded state by "
@@ -370,6 +349,14 @@ def _check_replay(log: StateLog, steps: np.ndarray, errors: np.ndarray) -> None:
             f"{STRAY:g} ({100 * STRAYS:.0f} % are allowed), the first of them step {steps[astray][0]}; its rows are "
             "not consecutive, so put them in order and mark the ends of episodes."
         )
+    wanted = _earned_by_running(env, rewards[best], actions[steps])
+    vx, speed_note = _checked_speed(log, env, len(actions), steps, wanted)
+    notes.append(
+        f"actions are {best}: a replayed step misses by {miss:.2g} in the median, in the other "
+        f"order by {np.median(errors[other]):.2g}; {100 * astray.mean():.2g} % miss by more than {STRAY:g}"
+    )
+    notes.append(speed_note)
+    return orders[best], vx
 
 
 def _checked_speed(
@@ -395,12 +382,6 @@ def _checked_speed(
             f"median ({SPEED_AGREES} is allowed); undo any scaling or sharing out of rewards first."
         )
     return vx, f"speeds follow from rewards, {off:.2g} m/s off in the median{how}"
-
-
-def _old_names(width: int, env: SafeMuJoCo) -> list[str]:
-    near = env.n_agents - 1 if env.parts == "4x2" else 2
-    own = width - near - 2
-    return [f"own{k}" for k in range(own)] + [f"near{k}.q" for k in range(near)] + ["torso.vx", "torso.x"]
 
 
 def _check_shape(where: str, name: str, array: np.ndarray, wanted: tuple[int, ...]) -> None:

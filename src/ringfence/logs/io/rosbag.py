@@ -17,7 +17,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.bagfile import ROLES, SHOWN, BagFile, Topic, joined, opened, topic_name
-from ringfence.utils.natural import natural
+from ringfence.utils.text import natural
 
 TWIST = ("vx", "vy", "wz")
 COMMAND = ("cmd_vx", "cmd_vy", "cmd_wz")
@@ -98,9 +98,11 @@ def read_bag(
 
 def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: list[str]) -> Bag:
     """All robots' rows, one robot after another, and which columns are natural as state and action."""
-    _frames([robot.odom for robot in robots], notes)
-    _refuse_two_kinds(path, [robot.odom for robot in robots])
-    _refuse_two_commands(path, robots)
+    frames = list(dict.fromkeys(frame for robot in robots for frame in robot.odom.frames))
+    if len(frames) > 1:  # robots' own frames begin where each was switched on
+        shown = ", ".join(f"'{f}'" for f in frames[:SHOWN]) + (" and more" if len(frames) > SHOWN else "")
+        notes.append(f"poses are in {len(frames)} frames ({shown}); positions compare only if these have one origin")
+    _refuse_two_kinds(path, robots)
     parts = [_columns_of(path, robot, clock, twist, notes) for robot in robots]
     _refuse_other_joints(path, robots, parts)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in ("time", *parts[0])}
@@ -134,7 +136,10 @@ def _asked_of(
     its name."""
     if cmd is None and any(joined(prefix, CMD) in bag.topics for prefix in prefixes):
         cmd = CMD
-    costs = [] if cost is None else _cost_topics(bag, prefixes, cost)
+    costs = [] if cost is None else [joined(prefix, cost) for prefix in prefixes]
+    team = "" if cost is None else topic_name(cost)
+    if cost is not None and (cost.startswith("/") or (team in bag.topics and not {*costs} & {*bag.topics})):
+        costs = [team] * len(prefixes)
     found = []
     for k, prefix in enumerate(prefixes):
         name = prefix.strip("/") or "robot"
@@ -176,14 +181,6 @@ def _prefixes(bag: BagFile, agents: str | Sequence[str], odom: str) -> list[str]
     return [f"{before}{word}{after}" for word in sorted(found, key=natural)]
 
 
-def _cost_topics(bag: BagFile, prefixes: list[str], cost: str) -> list[str]:
-    own = [joined(prefix, cost) for prefix in prefixes]
-    team = topic_name(cost)
-    if cost.startswith("/") or (team in bag.topics and not any(topic in bag.topics for topic in own)):
-        return [team] * len(prefixes)
-    return own
-
-
 # --- time ---
 @dataclass(frozen=True, eq=False)
 class Clock:
@@ -209,7 +206,7 @@ def _clock(
     poses = {topic.name for topic in odometry}
     topics = [*odometry, *(topic for name, topic in read.items() if name not in poses)]
     stamped = {t.name: t.stamps for t in topics if stamps and t.stamps is not None and t.stamps.any()}
-    lags = {t.name: _lag(t, stamped.get(t.name)) for t in topics}
+    lags = {t.name: _Lag.of(t, stamped.get(t.name)) for t in topics}
     lead = next((t.name for t in odometry if t.name in stamped), odometry[0].name)
     for topic in topics:
         if topic in odometry or topic.name in stamped:
@@ -219,7 +216,9 @@ def _clock(
     for topic in topics:
         if topic.name in stamped and not (foreign and topic in odometry):
             _refuse_late(path, topic.name, lags[topic.name], lags[lead], foreign)
-    times = {t.name: _times(t, stamped.get(t.name), foreign) for t in topics}
+    times = {t.name: t.logged for t in topics}
+    for name, given in stamped.items():  # where stamps are not set the times of recording, if both are of one clock
+        times[name] = given if foreign else np.where(given == 0, times[name], given)
     for topic in topics:
         _refuse_backwards(path, topic.name, times[topic.name], topic.name in stamped)
     if foreign:
@@ -240,12 +239,12 @@ class _Lag(NamedTuple):
     when: np.ndarray  # s, of recording
     seconds: np.ndarray
 
-
-def _lag(topic: Topic, stamps: np.ndarray | None) -> _Lag:
-    if stamps is None:
-        return _Lag(topic.logged / 1e9, np.zeros(len(topic.logged)))
-    given = stamps != 0
-    return _Lag(topic.logged[given] / 1e9, (topic.logged - stamps)[given] / 1e9)
+    @classmethod
+    def of(cls, topic: Topic, stamps: np.ndarray | None) -> _Lag:
+        if stamps is None:
+            return cls(topic.logged / 1e9, np.zeros(len(topic.logged)))
+        given = stamps != 0
+        return cls(topic.logged[given] / 1e9, (topic.logged - stamps)[given] / 1e9)
 
 
 def _refuse_another_clock(path: Path, name: str, lag: _Lag, lead: str, lag_of_lead: _Lag) -> None:
@@ -269,13 +268,6 @@ def _refuse_late(path: Path, name: str, lag: _Lag, lag_of_lead: _Lag, foreign: b
             f"{late[k]:.3g} s off the topic's others ({LATE:g} s are allowed); cut the bag there, or pass stamps=False "
             "to take the times of recording."
         )
-
-
-def _times(topic: Topic, stamps: np.ndarray | None, foreign: bool) -> np.ndarray:
-    """(M,) ns: stamps, and where they are not set the times of recording, if both are of one clock."""
-    if stamps is None:
-        return topic.logged
-    return stamps if foreign else np.where(stamps == 0, topic.logged, stamps)
 
 
 def _refuse_backwards(path: Path, name: str, times: np.ndarray, stamped: bool) -> None:
@@ -347,15 +339,14 @@ def _note_unknown(path: Path, robot: _Robot, known: np.ndarray, notes: list[str]
         notes.append(f"{(~known).sum()} rows of {robot.name} before its first {before} were dropped")
 
 
-def _refuse_two_kinds(path: Path, odometry: list[Topic]) -> None:
-    if len({topic.type == "nav_msgs/msg/Odometry" for topic in odometry}) > 1:
+def _refuse_two_kinds(path: Path, robots: list[_Robot]) -> None:
+    """Of odometry, and of commands."""
+    first = robots[0].odom
+    if len({robot.odom.type == "nav_msgs/msg/Odometry" for robot in robots}) > 1:
         raise StoreError(
-            f"'{path}': '{odometry[0].name}' is {odometry[0].type} and others are not, so only some agents have "
-            "velocities; pass fewer agents or another odom."
+            f"'{path}': '{first.name}' is {first.type} and others are not, so only some agents have velocities; pass "
+            "fewer agents or another odom."
         )
-
-
-def _refuse_two_commands(path: Path, robots: list[_Robot]) -> None:
     commands = [robot.cmd for robot in robots if robot.cmd is not None]
     other = next((topic for topic in commands if _command_of(topic) != _command_of(commands[0])), None)
     if other is not None:
@@ -437,14 +428,6 @@ def _doubt(
             f"velocities of '{topic.name}' are {off[twist]:.2g} m/s off its positions' differences in the median, and "
             f"{off[other]:.2g} with twist='{other}'"
         )
-
-
-def _frames(odometry: list[Topic], notes: list[str]) -> None:
-    """Note frames that differ: robots' own frames begin where each was switched on."""
-    frames = list(dict.fromkeys(f for t in odometry for f in t.frames))
-    if len(frames) > 1:
-        shown = ", ".join(f"'{f}'" for f in frames[:SHOWN]) + (" and more" if len(frames) > SHOWN else "")
-        notes.append(f"poses are in {len(frames)} frames ({shown}); positions compare only if these have one origin")
 
 
 def _joints(topic: Topic, agent: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:

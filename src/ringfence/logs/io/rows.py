@@ -1,4 +1,9 @@
-"""Rows of a table in order, their numbers, what is doubtful about them, and the rows in two parts by time."""
+"""Rows of a table: their columns in SI units, the rows in order, what is doubtful about their numbers, and the rows in
+two parts by time.
+
+Numbers are times a factor, degrees of longitude and latitude become metres, and angles their cosine and sine, since an
+angle jumps by a turn, and between -pi and pi lies no 0.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError
+from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.utils.natural import numbered
+from ringfence.utils.text import numbered
 
 COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
 LONG = 5.0  # s, a step that hardly any controller has
@@ -22,6 +27,20 @@ SPAN = 10  # rows that velocities are compared over
 JITTERS = 0.25  # power of rows, by which places move farther than they jitter: 0 of jitter alone, 0.5 of a random walk
 DEGREE = 111_000.0  # m of a degree of latitude
 MAX_SPEED = 100.0  # m/s that nothing there can do, unless somebody says what it can
+
+# WGS 84 and the transverse Mercator projection of UTM, by Krüger's series (Karney 2011, to the third order: 1 mm).
+RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
+N = FLATTENING / (2 - FLATTENING)
+MERIDIAN = RADIUS / (1 + N) * (1 + N**2 / 4 + N**4 / 64)
+SERIES = (N / 2 - 2 * N**2 / 3 + 5 * N**3 / 16, 13 * N**2 / 48 - 3 * N**3 / 5, 61 * N**3 / 240)
+SCALE, EASTING, NORTHING = 0.9996, 500_000.0, 10_000_000.0
+REACH = 9.0  # degrees from a zone's middle, beyond which distances are off by more than a hundredth
+POLES = 84.0  # degrees of latitude, where UTM ends
+
+ANGLES = ("theta", "yaw", "heading", "compass", "course", "bearing", "psi")
+DEGREES = ("_deg", "_degrees")
+RADIANS = ("_rad", "_radians")
+TURN = 2 * np.pi + 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +101,9 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     ended = _ends(columns, schema, len(clock))
     rows = Rows(order, recording[order], owner[order], clock[order], agents, ended[order])
     if schema.sort:
-        rows = rows.chosen(~_repeats(rows, columns, schema))
+        table = [columns[name][order] for name in schema.columns]
+        repeats = np.all([np.asarray(column[1:] == column[:-1], bool) for column in table], 0)
+        rows = rows.chosen(np.append(True, ~repeats))
     _refuse_disorder(rows, columns, schema)
     if not rows.follows.any():
         raise StoreError(
@@ -106,16 +127,6 @@ def _ended_together(rows: Rows) -> Rows:
     return replace(rows, ended=ended)
 
 
-def _repeats(rows: Rows, columns: Columns, schema: TableSchema) -> np.ndarray:
-    """(M,) whether a row says nothing that the one before does not say."""
-    same = np.ones(len(rows.order), bool)
-    same[0] = False
-    for name in schema.columns:
-        column = columns[name][rows.order]
-        same[1:] &= np.asarray(column[1:] == column[:-1], bool)
-    return same
-
-
 def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
     passed = np.diff(rows.time)
     same = (np.diff(rows.recording) == 0) & (np.diff(rows.agent) == 0)
@@ -130,44 +141,31 @@ def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
             continue
         k = int(np.flatnonzero(wrong)[np.argmin(rows.order[1:][wrong])])
         row = int(rows.order[k + 1])
-        when = _written(columns[schema.time][row])
+        time = columns[schema.time][row]
+        when = f"{time:.10g}" if isinstance(time, int | float | np.number) else str(time)  # as the table has it
         raise StoreError(
             f"row {row}: {schema.time}={when} {what} row {int(rows.order[k])} of the same agent "
             f"({schema.agent}={columns[schema.agent][row]}); {remedy}{where}"
         )
 
 
-def _written(time: object) -> str:
-    """A time as the table has it."""
-    return f"{time:.10g}" if isinstance(time, int | float | np.number) else str(time)
-
-
 def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
     """The numbers that the schema names; without a reward or cost, 0."""
-    columns = columns | {name: _until_the_last(columns[name], rows) for name in schema.action}
-    arrive = [name for name in (schema.reward, *schema.cost) if name is not None]
-    columns = columns | {name: _since_the_first(columns[name], rows) for name in arrive}
+    columns = dict(columns)
+    last = np.flatnonzero(np.append(~rows.follows, True))
+    last = last[last > 0]
+    for name in schema.action:  # nobody follows an agent's last command: one that is missing is the one before
+        columns[name] = _filled(columns[name], rows.order[last], columns[name][rows.order[last - 1]])
+    first = rows.order[np.append(True, ~rows.follows)]
+    for name in (schema.reward, *schema.cost):  # nothing came before an agent's first row: one that is missing is 0
+        if name is not None and columns[name].dtype.kind in "fO":  # no other has a missing number
+            columns[name] = _filled(columns[name], first, np.zeros(len(first), int))
     read = {name: numbers(columns, name)[rows.order] for name in (*schema.state, *schema.action, *schema.goal)}
     zero = np.zeros(len(rows.time))
     reward = numbers(columns, schema.reward)[rows.order] if schema.reward else zero
     costs = [numbers(columns, name)[rows.order] for name in schema.cost]
     single = tuple(name for name in read if columns[name].dtype == np.float32)
     return Values(read, reward, np.stack(costs or [zero], 1), single)
-
-
-def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
-    """A column of commands, whose last entry of each agent nobody follows: one that is missing is the one before."""
-    last = np.flatnonzero(np.append(~rows.follows, True))
-    last = last[last > 0]
-    return _filled(column, rows.order[last], column[rows.order[last - 1]])
-
-
-def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
-    """A column of what came since the row before, which an agent's first row has not: one that is missing is 0."""
-    if column.dtype.kind not in "fO":  # no other has a missing number
-        return column
-    first = rows.order[np.append(True, ~rows.follows)]
-    return _filled(column, first, np.zeros(len(first), int))
 
 
 def _filled(column: np.ndarray, where: np.ndarray, instead: np.ndarray) -> np.ndarray:
@@ -192,7 +190,7 @@ def _ends(columns: Columns, schema: TableSchema, count: int) -> np.ndarray:
     return flags > 0
 
 
-# --- units ---
+# --- jumps and other doubts ---
 def refuse_jumps(rows: Rows, values: Values, schema: TableSchema) -> None:
     """Refuse rows that nothing can lie apart by."""
     if not schema.position:
@@ -248,7 +246,14 @@ def doubts(rows: Rows, values: Values, dt: float, schema: TableSchema) -> Iterat
     if dt >= LONG:
         yield f"a step is {dt:g} s: if times are in ms, µs or frames, say how long one is (time_unit)"
     if schema.action:
-        yield from _large_actions(values, schema)
+        sizes = np.abs(values.stacked(schema.action))
+        largest = float(sizes.max())
+        usual = float(np.quantile(sizes, 0.99, axis=0).max())
+        if largest > 10 * usual:
+            yield (
+                f"the largest action is {largest:.4g}, 99 % are below {usual:.4g}: all are learned in units of the "
+                "largest"
+            )
     if not schema.position:
         yield "state holds no x, y or z, so nobody sees where others are relative to oneself"
 
@@ -319,16 +324,6 @@ def _jumps(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
         )
 
 
-def _large_actions(values: Values, schema: TableSchema) -> Iterator[str]:
-    sizes = np.abs(values.stacked(schema.action))
-    largest = float(sizes.max())
-    usual = float(np.quantile(sizes, 0.99, axis=0).max())
-    if largest > 10 * usual:
-        yield (
-            f"the largest action is {largest:.4g}, 99 % are below {usual:.4g}: all are learned in units of the largest"
-        )
-
-
 # --- two parts: to learn by and to judge by ---
 def parted(rows: Rows, values: Values, share: float) -> tuple[Rows, Values]:
     """The rows with each part as recordings of its own, those of the first `share` of the rows in front, so that no
@@ -367,3 +362,118 @@ def _late_recordings(rows: Rows, share: float) -> np.ndarray:
     before = np.empty(len(count))
     before[order] = np.cumsum(count[order])
     return (before > share * len(rows.order) + 0.5)[rows.recording]
+
+
+# --- units ---
+def in_metres(columns: Columns, schema: TableSchema) -> tuple[Columns, list[str]]:
+    """The columns in SI units, as the schema's `scale` and `project` say, and what was made of degrees."""
+    for name in schema.scale:
+        if name not in schema.numbers:
+            raise unknown("column of numbers", name, schema.numbers)
+    columns = columns | {name: _times(columns, name, factor) for name, factor in schema.scale.items()}
+    if schema.project != "utm":
+        return columns, []
+    pairs = [("x", "y"), schema.goal[:2]] if schema.goal else [("x", "y")]
+    degrees = [[numbers(columns, name) for name in pair] for pair in pairs]
+    for pair, values in zip(pairs, degrees):
+        for name, value, largest in zip(pair, values, (180.0, POLES)):
+            _require_degrees(name, value, largest)
+    zone, north = zone_of(*degrees[0])
+    for pair, values in zip(pairs, degrees):
+        columns |= dict(zip(pair, utm(values[0], values[1], zone, north)))
+    return columns, [f"degrees of longitude and latitude are metres of UTM zone {zone}{'N' if north else 'S'}"]
+
+
+def _times(columns: Columns, name: str, factor: float) -> np.ndarray:
+    """A column times a factor; what is missing in it stays so, for whoever reads it to judge."""
+    column = columns[name]
+    return (column if column.dtype.kind in "iuf" else numbers(columns, name)) * factor
+
+
+def _require_degrees(name: str, value: np.ndarray, largest: float) -> None:
+    beyond = np.abs(value) > largest
+    if beyond.any():
+        row = int(np.flatnonzero(beyond)[0])
+        raise StoreError(
+            f"row {row}: {name} is {value[row]:.10g}, and degrees of UTM are within {largest:g}; scale it to degrees "
+            f"(--scale {name}=1e-7 of tenths of a millionth), drop the row, or see that x is the longitude."
+        )
+
+
+def zone_of(longitude: np.ndarray, latitude: np.ndarray) -> tuple[int, bool]:
+    """The UTM zone in which places lie in the mean, 1 to 60, and whether it is of the north."""
+    mean = float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(longitude)).mean())))
+    zone = int((mean + 180) // 6) % 60 + 1
+    far = np.abs((longitude - _middle(zone) + 180) % 360 - 180)
+    if far.max() > REACH:
+        row = int(np.flatnonzero(far > REACH)[0])
+        raise StoreError(
+            f"row {row}: the longitude {longitude[row]:.6g} is {far[row]:.3g} degrees from the middle of UTM zone "
+            f"{zone}, where most rows are, and UTM is true within {REACH:g}; import one region at a time."
+        )
+    return zone, bool(np.median(latitude) >= 0)
+
+
+def utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, north: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Easting and northing (m) of degrees in a UTM zone."""
+    sine = np.sin(np.deg2rad(latitude))
+    around = np.deg2rad(longitude - _middle(zone))
+    bend = 2 * np.sqrt(N) / (1 + N)
+    t = np.sinh(np.arctanh(sine) - bend * np.arctanh(bend * sine))
+    xi, eta = np.arctan2(t, np.cos(around)), np.arctanh(np.sin(around) / np.hypot(1, t))
+    x, y = eta.copy(), xi.copy()
+    for k, a in enumerate(SERIES, 1):
+        x += a * np.cos(2 * k * xi) * np.sinh(2 * k * eta)
+        y += a * np.sin(2 * k * xi) * np.cosh(2 * k * eta)
+    return EASTING + SCALE * MERIDIAN * x, (0.0 if north else NORTHING) + SCALE * MERIDIAN * y
+
+
+def _middle(zone: int) -> float:
+    """Degrees of longitude of a zone's middle."""
+    return 6.0 * zone - 183.0
+
+
+# --- angles ---
+def without_angles(columns: Columns, schema: TableSchema) -> tuple[Columns, TableSchema, list[str]]:
+    """The columns and the schema with `cos_yaw` and `sin_yaw` instead of `yaw`, and a note. Angles are known by their
+    names; they are in radians, `compass` and what ends in `_deg` in degrees."""
+    angles = [name for name in schema.state if _plain(name) in ANGLES]
+    if not angles:
+        return columns, schema, []
+    found = dict(columns)
+    for name in angles:
+        angle = _radians(columns, name)
+        found |= {f"cos_{name}": np.cos(angle), f"sin_{name}": np.sin(angle)}
+    state: list[str] = []
+    for name in schema.state:
+        state += [f"cos_{name}", f"sin_{name}"] if name in angles else [name]
+    note = f"angles are observed as cosine and sine, since they jump by a turn: {', '.join(angles)}"
+    return found, replace(schema, state=tuple(state)), [note]
+
+
+def angle_of(name: str, value: np.ndarray) -> np.ndarray:
+    """Radians of an angle of that name."""
+    return np.deg2rad(value) if _in_degrees(name) else value
+
+
+def _radians(columns: Columns, name: str) -> np.ndarray:
+    value = numbers(columns, name)
+    largest = float(np.abs(value).max())
+    if not _in_degrees(name) and not name.endswith(RADIANS) and largest > TURN:
+        raise StoreError(
+            f"{name} reaches {largest:.4g}: if it is in degrees, call it {name}_deg (--rename {name}={name}_deg), "
+            f"if it counts turns in radians, {name}_rad."
+        )
+    return angle_of(name, value)
+
+
+def _in_degrees(name: str) -> bool:
+    return name.endswith(DEGREES) or _plain(name) == "compass"
+
+
+def _plain(name: str) -> str:
+    """The last word of a dotted name, without its unit."""
+    word = name.rpartition(".")[2].lower()
+    for unit in (*DEGREES, *RADIANS):
+        word = word.removesuffix(unit)
+    return word

@@ -8,7 +8,8 @@ follows from what (docs/import.md).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,21 +38,22 @@ from ringfence.logs.io.rows import (
     Values,
     blurred,
     doubts,
+    in_metres,
     parted,
     refuse_jumps,
     sorted_rows,
     values_of,
+    without_angles,
     without_jumps,
 )
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample, unrounded
-from ringfence.logs.io.units import in_metres, without_angles
-from ringfence.logs.io.wide import read_wide
 from ringfence.logs.moving import looked_at, origins_of
 from ringfence.problem.constraints import CostColumn
 
 USUAL = 0.999  # of accelerations, that are no outliers
 RECORDING = "ringfence.recording"  # column that tells apart what is of several tables
+AGENT, COLUMN = "{agent}", "{column}"  # in how wide tables call columns
 STANDS_OUT = 2.0  # times that, above which the largest are outliers
 
 
@@ -239,7 +241,7 @@ def _columns_of(table: Table, schema: TableSchema, whose: str) -> tuple[Columns,
     texts = [name for name in (schema.agent, schema.episode, schema.time_format and schema.time) if name]
     form = Form(schema.header, schema.decimal, tuple(theirs.get(name, name) for name in texts))
     if schema.wide is not None:
-        columns = read_wide(table, schema, theirs, form)
+        columns = _read_wide(table, schema, theirs, form)
     else:
         named = list(schema.columns)
         if schema.join and theirs.get(schema.agent, schema.agent) not in names_of(table, form):
@@ -323,24 +325,23 @@ def _arrays(
 ) -> dict[str, Any]:
     """What an `EpisodeStore` is made of. What the table has `lost` is not found again by moving it."""
     schema = motion.schema
+    warnings = list(warnings)
     costs = episodes.cost[episodes.arrives]
-    if _of_team(costs, schema.homogeneous):
+    # the team's where all have the same; one that stands for any number has its own
+    if not schema.homogeneous if costs.shape[1] == 1 else (costs == costs[:, :1]).all():
         if costs.shape[1] > 1 and costs.any():
-            warnings = [*warnings, "all agents have the same costs: they are taken for the team's"]
+            warnings.append("all agents have the same costs: they are taken for the team's")
         costs = costs[:, 0]
-    warnings = [*warnings, *_costly_starts(motion, episodes)]
-    actions = _actions(motion, episodes)[episodes.leaves]
+    warnings += _costly_starts(motion, episodes)
+    rows = episodes.rows
+    actions = (motion.tracks.action[rows] if schema.action else motion.accelerations(rows))[episodes.leaves]
     low, high = _of_commands(actions) if schema.action else _usual(actions)
-    warnings = [*warnings, *_one_sided(schema.action, low, high, card)]
+    warnings += _one_sided(schema.action, low, high, card)
     outliers = int((np.abs(actions) > high).any(-1).sum()) if not schema.action else 0
     if outliers:
-        largest = float(np.abs(actions).max())
+        cut = f"{float(np.abs(actions).max()):.4g} m/s² are outliers and cut to {high.max():.4g}"
+        warnings.append(f"{outliers} accelerations of up to {cut}, which {100 * USUAL:g} % are within")
         actions = np.clip(actions, low, high)
-        warnings = [
-            *warnings,
-            f"{outliers} accelerations of up to {largest:.4g} m/s² are outliers and cut to {high.max():.4g}, which "
-            f"{100 * USUAL:g} % are within",
-        ]
     facts = {
         "task": "table",
         "observation_names": [entry.name for entry in episodes.entries],
@@ -356,12 +357,12 @@ def _arrays(
         facts |= {"homogeneous": True, "sensing_radius": episodes.sensing_radius}
     named = len(schema.cost) > 1
     ends = np.cumsum(episodes.lengths - 1)
-    rows = looked_at(ends)
-    rows = rows[:: 1 + len(rows) * len(episodes.entries) * episodes.rows.shape[1] // BLOCK]
+    steps = looked_at(ends)
+    steps = steps[:: 1 + len(steps) * len(episodes.entries) * rows.shape[1] // BLOCK]
     if origins is not None:
         origins = origins if origins.any() else None
     elif not lost and not card.get("observation_origins"):
-        before, after = (episodes.seen(episodes.rows[each]) for each in (rows, rows + 1))
+        before, after = (episodes.seen(rows[each]) for each in (steps, steps + 1))
         origins = origins_of({"observations": (before, after)}).get("observations")
     return {
         "observations": episodes.observations(np.zeros(len(episodes.entries)) if origins is None else origins),
@@ -370,7 +371,7 @@ def _arrays(
         "rewards": _rewards(motion, episodes)[episodes.arrives],
         "costs": dict(zip(schema.cost, np.moveaxis(costs, -1, 0))) if named else costs[..., 0],
         "episode_ends": ends,
-        "terminated": motion.tracks.ended[episodes.rows[episodes.last]].any(1),
+        "terminated": motion.tracks.ended[rows[episodes.last]].any(1),
         "card": {**facts, **card},
     }
 
@@ -419,21 +420,72 @@ def _usual(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return -found, found
 
 
-def _of_team(costs: np.ndarray, homogeneous: bool) -> bool:
-    """Whether costs (T, N, K) are the same for all agents. One that stands for any number has its own."""
-    return not homogeneous if costs.shape[1] == 1 else bool((costs == costs[:, :1]).all())
-
-
-def _actions(motion: Motion, episodes: Episodes) -> np.ndarray:
-    """(W, N, A): the commands, or accelerations where the table has none."""
-    if motion.schema.action:
-        return motion.tracks.action[episodes.rows]
-    return motion.accelerations(episodes.rows)
-
-
 def _rewards(motion: Motion, episodes: Episodes) -> np.ndarray:
     """(W, N) on arriving in a row: logged, or by how much the goal has come nearer, or 0."""
     if motion.schema.reward or not motion.schema.goal:
         return motion.tracks.earned[episodes.rows]
     distance = np.linalg.norm(motion.to_goal, axis=1)[episodes.rows]
     return -np.diff(distance, axis=0, prepend=distance[:1])
+
+
+def _read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str], form: Form) -> Columns:
+    """The schema's columns of a table with columns for every agent, agent by agent. A column that no agent has of its
+    own is everybody's. Rows in which all of an agent's own columns are missing are left out: it was away. `theirs` are
+    names in the table, by ours."""
+    assert schema.wide is not None
+    shared = {name for name in (schema.time, schema.episode) if name}
+    asked = [name for name in schema.columns if name not in shared and name != schema.agent]
+    own = _owners(schema.wide, names_of(table, form), {name: theirs.get(name, name) for name in asked})
+    agents = list(dict.fromkeys(agent for columns in own.values() for agent in columns))
+    if not agents:
+        raise UserError(
+            f"wide='{schema.wide}' fits no column of {', '.join(asked[:5])}; write it with {AGENT} and {COLUMN} as the "
+            "table's columns are called."
+        )
+    for name, columns in own.items():
+        lacking = [agent for agent in agents if agent not in columns]
+        if columns and lacking:
+            column = schema.wide.replace(COLUMN, theirs.get(name, name)).replace(AGENT, lacking[0])
+            raise StoreError(
+                f"The agent '{lacking[0]}' has no column '{column}', and "
+                f" '{next(iter(columns))}' has; leave {name} out, or add it."
+            )
+    everybodys = {name: theirs.get(name, name) for name in (*shared, *(name for name in asked if not own[name]))}
+    read = read_columns(
+        table, [*everybodys.values(), *(column for columns in own.values() for column in columns.values())], form
+    )
+    columns = {name: read[column] for name, column in everybodys.items()}
+    parts = []
+    for agent in agents:
+        mine = {name: read[columns_of[agent]] for name, columns_of in own.items() if columns_of}
+        there = ~np.stack([_missing(column) for column in mine.values()]).all(0)
+        rows = {name: column[there] for name, column in (columns | mine).items()}
+        parts.append(rows | {schema.agent: np.full(int(there.sum()), agent)})
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _owners(wide: str, names: Iterable[str], asked: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """For every asked column, the table's columns of it by agent. A name that fits several is of the longest column:
+    `leadervx` is vx of `leader`, not x of `leaderv`."""
+    own: dict[str, dict[str, str]] = {name: {} for name in asked}
+    by_length = sorted(asked, key=lambda name: -len(asked[name]))
+    patterns: dict[str, re.Pattern[str]] = {}
+    for name in by_length:
+        before, after = wide.replace(COLUMN, asked[name]).split(AGENT)
+        patterns[name] = re.compile(f"{re.escape(before)}(?P<agent>.+){re.escape(after)}")
+    for column in names:
+        for name in by_length:
+            found = patterns[name].fullmatch(column)
+            if found:
+                own[name][found["agent"]] = column
+                break
+    return own
+
+
+def _missing(column: np.ndarray) -> np.ndarray:
+    """(M,) whether an entry is None or NaN."""
+    if column.dtype.kind == "f":
+        return np.asarray(np.isnan(column).reshape(len(column), -1).all(1))
+    if column.dtype.kind != "O":
+        return np.zeros(len(column), bool)
+    return np.array([entry is None or (isinstance(entry, float) and entry != entry) for entry in column], bool)

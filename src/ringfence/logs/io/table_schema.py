@@ -188,7 +188,7 @@ def _episodes(schema: TableSchema) -> None:
             raise UserError(f"{name}={value!r:.60} must be a number above 0, and at most {LARGEST:g}.")
 
 
-def _state_and_goal(schema: TableSchema) -> None:
+def _columns(schema: TableSchema) -> None:
     if not schema.state:
         raise UserError("state names no column; name those that say where an agent is and how it moves.")
     if schema.goal and len(schema.goal) != len(schema.position):
@@ -198,9 +198,6 @@ def _state_and_goal(schema: TableSchema) -> None:
         )
     if (schema.homogeneous or schema.danger is not None) and not schema.position:
         raise UserError("state holds no x, y or z, which neighbours and distances follow from; rename these columns.")
-
-
-def _danger_and_action(schema: TableSchema) -> None:
     if schema.danger is not None and not isinstance(schema.danger, Separation):
         raise UserError(
             f"danger={type(schema.danger).__name__} is not read from a table; give a Separation or a cost column."
@@ -293,8 +290,7 @@ def _unit_of(words: list[str], units: Mapping[float | None, str]) -> tuple[str, 
 RULES: tuple[Callable[[TableSchema], None], ...] = (
     _words,
     _episodes,
-    _state_and_goal,
-    _danger_and_action,
+    _columns,
     _written,
     _project,
     _units,

@@ -133,28 +133,24 @@ def _unit(time: np.ndarray) -> float:
 def on_whole_steps(rows: Rows, clock: Clock) -> tuple[Rows, list[str]]:
     """The rows with times from 0 in each recording. Where a clock drifts or its first row comes late, so that rows
     would slip by more than a quarter of a step, steps are counted by rows, and a sentence says how far it drifted."""
-    spacing = _spacing(clock.dt, rows.step)
+    dt, step = clock.dt, rows.step
+    many = round(max(dt / step, step / dt))
+    spacing = dt / many if dt >= step else dt * many  # s between rows: dt is a whole number of it, or a whole part
+    counted = abs(spacing / step - 1) < CLOSE
     time = rows.time.copy()
     begins = np.flatnonzero(is_first(rows.recording))
     furthest = 0.0
     for here in (slice(*ends) for ends in zip(begins, [*begins[1:], len(time)])):
         time[here] -= time[here].min()
-        steps = time[here] / clock.dt
-        if spacing is None or float(np.abs(steps - np.round(steps)).max()) <= SLIPS:
+        steps = time[here] / dt
+        if not counted or float(np.abs(steps - np.round(steps)).max()) <= SLIPS:
             continue
         slip = _slip(time[here], rows.agent[here], spacing)
-        if slip is not None and float(np.abs(slip).max()) * spacing > SLIPS * clock.dt:
-            furthest = max(furthest, float(np.ptp(slip)) * spacing / clock.dt)
+        if slip is not None and float(np.abs(slip).max()) * spacing > SLIPS * dt:
+            furthest = max(furthest, float(np.ptp(slip)) * spacing / dt)
             time[here] = np.where(time[here] == 0, 0, time[here] - slip * spacing)
-    said = f"a clock drifts by up to {furthest:.3g} steps of {clock.dt:g} s: steps are counted by rows"
+    said = f"a clock drifts by up to {furthest:.3g} steps of {dt:g} s: steps are counted by rows"
     return replace(rows, time=time), [said] if furthest > SLIPS else []
-
-
-def _spacing(dt: float, step: float) -> float | None:
-    """s between rows of which `dt` is a whole number, or a whole part of one: what is near the rows' own `step`."""
-    many = round(max(dt / step, step / dt))
-    spacing = dt / many if dt >= step else dt * many
-    return spacing if abs(spacing / step - 1) < CLOSE else None
 
 
 def _slip(time: np.ndarray, agent: np.ndarray, spacing: float) -> np.ndarray | None:

@@ -1,13 +1,14 @@
-"""Entries that are angles, and begin again after a whole turn.
+"""What entries change by in a step, where that is not their difference.
 
-A heading of 3.1 rad and one of -3.1 are neighbours. Read as numbers they are a whole turn apart: what changes by it
-looks like a kick, and a prediction that passes the end goes where no angle is.
+Angles begin again after a whole turn: a heading of 3.1 rad and one of -3.1 are neighbours. Read as numbers they are a
+whole turn apart: what changes by it looks like a kick, and a prediction that passes the end goes where no angle is.
+Places go with velocities, whose next ones they may go with as well.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,6 +23,10 @@ BEYOND = 0.01  # of a turn, by which it may pass its ends: some are rounded, som
 JUMPS = 5  # steps that pass the end
 SHORT = 0.125  # of a turn, the shorter way round, in which most of these go: what is drawn anew jumps by any share
 LIKE = 2.0  # times what other steps change by, nine in ten of them: so much most of these do, too
+TURNS = 0.01  # of the largest velocity: a smaller change tells nothing
+FEW = 20  # changes, below which nothing is said
+AGREE = 0.025  # of a share
+USUAL = 0.2  # share of the changes that has to agree
 
 
 class Turn(NamedTuple):
@@ -32,12 +37,9 @@ class Turn(NamedTuple):
     whole: float  # to where it begins again, less that
 
 
-def found_in(before: np.ndarray, after: np.ndarray) -> tuple[Turn, ...]:
+def turns_in(before: np.ndarray, after: np.ndarray) -> tuple[Turn, ...]:
     """The angles among the entries of features (W, N, D) before and after steps."""
-    return tuple(_found_in(before, after))
-
-
-def _found_in(before: np.ndarray, after: np.ndarray) -> Iterator[Turn]:
+    found = []
     lowest, highest = before.min((0, 1)), before.max((0, 1))
     for entry, (least, most) in enumerate(zip(lowest.tolist(), highest.tolist())):
         for low, whole in KINDS:
@@ -50,8 +52,9 @@ def _found_in(before: np.ndarray, after: np.ndarray) -> Iterator[Turn]:
                 continue
             usual = LIKE * np.quantile(np.abs(change[~jumps]), 0.9)
             if np.median(whole - np.abs(change[jumps])) <= min(SHORT * whole, usual):
-                yield Turn(entry, low, whole)
+                found.append(Turn(entry, low, whole))
                 break
+    return tuple(found)
 
 
 def apart(turns: Sequence[Turn], after: X, before: X) -> X:
@@ -96,3 +99,22 @@ def _put(x: X, entries: np.ndarray, values: X) -> X:
     changed = x.copy()
     changed[..., entries] = values
     return changed
+
+
+def late_share(moved: np.ndarray, before: np.ndarray, after: np.ndarray, dt: float) -> float | None:
+    """The share c of a step of `dt` seconds that bodies go with their next velocity, as logged: a place moves by
+    ((1 − c) v + c v′) dt. Logs differ: a velocity is what a simulator goes on with, the mean of a step, or the
+    difference to the place before. All three of any shape; None where the logs do not say.
+
+    It is the most frequent share and no mean: where others are listed by distance, a place in the list may change its
+    owner from one row to the next.
+    """
+    change = ((after - before) * dt).ravel()
+    rest = (moved - before * dt).ravel()
+    turns = np.abs(change) > TURNS * max(float(np.abs(before).max(initial=0.0)) * dt, 1e-9)
+    if turns.sum() < FEW:
+        return None
+    share = rest[turns] / change[turns]
+    tried = np.linspace(0, 1, 21)
+    agree = np.array([(np.abs(share - one) < AGREE).mean() for one in tried])
+    return float(round(tried[agree.argmax()], 2)) if agree.max() > USUAL else None
