@@ -12,14 +12,13 @@ from ringfence.cli import app
 from ringfence.deploy.controller import Controller
 from ringfence.errors import UserError
 from ringfence.evaluation.certificate import Certificate
-from ringfence.evaluation.certify import certify
+from ringfence.evaluation.certify import Windowed, certify
 from ringfence.evaluation.replay import judge
 from ringfence.evaluation.replay.judge import Body, Played, check_view, radius_of, rows_of
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film
 from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
 from ringfence.evaluation.replay.stage import Stage
-from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults
 from ringfence.guards.policy import build
