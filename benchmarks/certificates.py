@@ -265,7 +265,7 @@ def case(what: str, promised: float, rate: float) -> dict[str, Any]:
 
 def first_alarm(promised: float, violated: np.ndarray) -> float:
     """The episode after which the alarm is raised; infinite where it never is."""
-    from ringfence.evaluation.monitor import Monitor
+    from ringfence.evaluation.certificate import Monitor
 
     monitor = Monitor(promised)
     for k, one in enumerate(violated):

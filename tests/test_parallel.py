@@ -21,9 +21,8 @@ from ringfence.errors import UserError
 from ringfence.evaluation import stress
 from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.certify import Foresight, certify
-from ringfence.evaluation.play import play_all, simulators_of
+from ringfence.evaluation.play import play_all, simulator, simulators_of
 from ringfence.evaluation.player import player_of_run, shape_of
-from ringfence.evaluation.simulators import simulator
 from ringfence.faults import Faults
 from ringfence.loading import resolve
 from ringfence.loading.spec import PolicySpec

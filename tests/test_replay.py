@@ -14,18 +14,16 @@ from ringfence.errors import UserError
 from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.certify import Windowed, certify
 from ringfence.evaluation.replay import judge
-from ringfence.evaluation.replay.judge import Body, Played, check_view, radius_of, rows_of
-from ringfence.evaluation.replay.motion import kinematics_of
-from ringfence.evaluation.replay.result import Film
+from ringfence.evaluation.replay.judge import Body, Film, Played, check_view, radius_of, rows_of
 from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
-from ringfence.evaluation.replay.stage import Stage
+from ringfence.evaluation.replay.stage import Stage, kinematics_of
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.names import Names
-from ringfence.report import replay_page
+from ringfence.report import logs_pages
 from ringfence.world import save
 from ringfence.world.card import Verdict
 from ringfence.world.causes import Cause, Edge, Found
@@ -126,7 +124,7 @@ def test_who_flies_is_replayed_in_space(tmp_path):
         ringfence.replay(None, flyers(), radius=RADIUS, guard="none", kinematics="bicycle")
     place = stage.play("seek").place[0]
     film = Film("seek", others=w.others_at[0], logged=w.place[0], alone=place, guarded=place)
-    assert "<svg" in replay_page._drawn(film, RADIUS, 0)
+    assert "<svg" in logs_pages._drawn(film, RADIUS, 0)
 
 
 def test_driven_agents_observe_what_they_would():

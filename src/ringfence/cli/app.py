@@ -18,9 +18,7 @@ from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
 from ringfence.cli.console import Refusals, complain, console, plain_warnings
 from ringfence.cli.doctor import doctor
-from ringfence.cli.faults import NO_FAULTS, Wrong
-from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
-from ringfence.cli.replaying import AS_LOGGED, Replayed
+from ringfence.cli.flags import AS_IT_IS, AS_LOGGED, NO_FAULTS, Assignments, How, Playing, Replayed, Wrong, assignments
 from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import lines, terminal
@@ -150,7 +148,7 @@ def fit(
         print(world.save(made, out_file))
     if report is not None and store is not None:
         from ringfence.datasets.audit import audit
-        from ringfence.report.ope_page import build_ope
+        from ringfence.report.logs_pages import build_ope
 
         print(build_ope(report, made.card, audit(store)))
     if made.card.verdict is not None and made.card.verdict.word == "unfit":
@@ -283,7 +281,7 @@ def play(
         compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.play import play as run_play
-    from ringfence.evaluation.simulators import simulator
+    from ringfence.evaluation.play import simulator
     from ringfence.training.worlds import with_world
 
     given = playing.arguments()
@@ -364,7 +362,7 @@ def stress(
             good for.
         env: what makes a simulator of your own, as FILE.py:NAME or MODULE:NAME. It is run.
     """
-    from ringfence.evaluation.simulators import simulator
+    from ringfence.evaluation.play import simulator
     from ringfence.evaluation.stress import stress as run_stress
     from ringfence.training.worlds import with_world
 
@@ -420,7 +418,7 @@ def certify(
         logs: a store of its task, which is replayed: its first half calibrates the margin, its second gives the bound.
     """
     from ringfence.evaluation.certify import certify as run_certify
-    from ringfence.evaluation.simulators import simulator
+    from ringfence.evaluation.play import simulator
     from ringfence.training.worlds import with_world
 
     faults = wrong.faults()
@@ -516,7 +514,7 @@ def ope(
     from ringfence.datasets.audit import audit
     from ringfence.evaluation import ope as evaluation
     from ringfence.loading.spec import PolicySpec
-    from ringfence.report.ope_page import build_ope
+    from ringfence.report.logs_pages import build_ope
     from ringfence.training import worlds
 
     given = playing.arguments()
@@ -559,7 +557,7 @@ def replay(
         compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.replay import replay as replayed
-    from ringfence.report.replay_page import build_replay
+    from ringfence.report.logs_pages import build_replay
     from ringfence.training.runs import write_json
     from ringfence.training.worlds import with_world
 

@@ -13,9 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.deploy.evidence import Evidence, explaining
-from ringfence.deploy.stamps import Stamps
-from ringfence.deploy.watch import Fallback, Watch, widened
+from ringfence.deploy.watch import Evidence, Fallback, Stamps, Watch, explaining, widened
 from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.evaluation.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,10 @@ from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, known, of_kind, whole_number
 from ringfence.evaluation.compensation import compensated
-from ringfence.evaluation.replay.drivers import DRIVERS
-from ringfence.evaluation.replay.motion import kinematics_of
-from ringfence.evaluation.replay.result import Film, ReplayResult, Row
 from ringfence.evaluation.replay.scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
-from ringfence.evaluation.replay.stage import Driven, Stage
+from ringfence.evaluation.replay.stage import DRIVERS, Driven, Stage, kinematics_of
 from ringfence.evaluation.rollout import FORESEEN
+from ringfence.evaluation.statistics import clopper_pearson
 from ringfence.faults import Faults
 from ringfence.guards import GUARDS, Guard
 from ringfence.guards.policy import Guarded, build
@@ -472,3 +470,96 @@ def _film(stage: Stage, played: Played, guard: str) -> Film:
         alone=plain.place[k],
         guarded=guarded.place[k],
     )
+
+
+@dataclass(frozen=True)
+class Row:
+    """A policy under one filter. Counts are of windows; intervals are exact, at 95 %."""
+
+    policy: str
+    filter: str  # none, brake, formula, or the guard's name
+    windows: int
+    logged: int  # with contact as logged
+    alone: int  # with contact of the same policy without a filter
+    contacts: int
+    prevented: int
+    caused: int
+    infeasible: float | None = None  # share of steps in which the guard cannot do what it should
+    ood: float | None = None  # and in which it is out of distribution
+    margin: float | None = None  # median of the guard's margin
+    by_agent: tuple[dict[str, Any], ...] = ()  # the same of each driven agent
+
+    @property
+    def contacts_interval(self) -> tuple[float, float]:
+        low, high = clopper_pearson(self.contacts, self.windows)
+        return low, high
+
+    @property
+    def caused_interval(self) -> tuple[float, float]:
+        low, high = clopper_pearson(self.caused, self.windows)
+        return low, high
+
+    @property
+    def prevented_interval(self) -> tuple[float, float] | None:
+        """Of the contacts without a filter; None where there are none."""
+        if not self.alone:
+            return None
+        low, high = clopper_pearson(self.prevented, self.alone)
+        return low, high
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """One window: places in metres."""
+
+    title: str
+    others: np.ndarray  # (L+1, K, X) along X axes
+    logged: np.ndarray  # (L+1, X)
+    alone: np.ndarray  # (L+1, X) the policy without guard
+    guarded: np.ndarray  # (L+1, X)
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """Rows by policy and filter, all of the same windows."""
+
+    task: str
+    radius: float  # m
+    radius_from: str
+    kinematics: str
+    steps: int
+    seconds: float
+    windows: int
+    begun_in_contact: int  # windows left out
+    guard: str
+    verdict: str | None  # of the World
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+    films: tuple[Film, ...] = field(default=(), repr=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the films, with intervals, as files hold it."""
+        made = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("rows", "films")}
+        intervals = ("contacts_interval", "prevented_interval", "caused_interval")
+        made["rows"] = [asdict(row) | {name: getattr(row, name) for name in intervals} for row in self.rows]
+        return made
+
+    def row(self, policy: str, filter: str) -> Row:
+        return next(row for row in self.rows if (row.policy, row.filter) == (policy, filter))
+
+    def summary(self) -> list[str]:
+        """Lines for a terminal."""
+        first = self.rows[0]
+        lines = [
+            f"{self.task}: {self.windows} windows of {self.seconds:.3g} s, contact below {self.radius:.3g} m "
+            f"({self.radius_from}), kinematics {self.kinematics}; as logged {first.logged} with contact",
+            f"{'policy':12} {'filter':10} {'contacts':>8} {'prevented':>16} {'caused':>7}  of windows (95 %)",
+        ]
+        for row in self.rows:
+            share = f"{row.prevented} of {row.alone}" if row.filter != "none" else "–"
+            low, high = row.contacts_interval
+            lines.append(
+                f"{row.policy:12} {row.filter:10} {row.contacts:8} {share:>16} {row.caused:7}  "
+                f"contacts {100 * row.contacts / row.windows:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+            )
+        return [*lines, *self.notes]

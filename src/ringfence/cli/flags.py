@@ -1,4 +1,4 @@
-"""How a run is to be played, as flags that several commands share."""
+"""Flags that several commands share: how a run is played, how logs are replayed, what goes wrong in a closed loop."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from ringfence.errors import UserError
+from ringfence.faults.faults import Chance, Faults
 
 # --set a=1 b=2 and --set a=1 --set b=2 mean the same.
 Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
@@ -93,3 +94,47 @@ def assignments(given: list[list[str]]) -> dict[str, str]:
             raise UserError(f"--set gives {name} twice, {changes[name]} and {value}; give one of them.")
         changes[name] = value
     return changes
+
+
+@dataclass(frozen=True)
+class Replaying:
+    """Windows of logs in which one agent is driven; docs/replay.md says how."""
+
+    kinematics: Literal["double_integrator", "holonomic", "unicycle", "bicycle", "world"] | None = None
+    """how the driven agent moves; by default a double integrator where that explains the logs, else the World's."""
+    wheelbase: float = 2.7
+    """m, of a bicycle."""
+    radius: float | None = None
+    """m between two agents below which they touch; by default the task's formula, else as costs tell it, else the
+    World's causes."""
+    steps: int | None = None
+    """of a window; 8 s by default."""
+    every_episode: bool = False
+    """replay the episodes that the World learned from, too."""
+
+    def arguments(self) -> dict[str, Any]:
+        """The same as arguments of `replay` and `certify`."""
+        return dataclasses.asdict(self)
+
+
+AS_LOGGED = Replaying()
+Replayed = Annotated[tyro.conf.OmitArgPrefixes[Replaying], tyro.conf.arg(name="replays")]
+
+
+@dataclass(frozen=True)
+class FaultFlags(Faults):
+    """What goes wrong; docs/certificates.md says what each does."""
+
+    asynchrony: Annotated[Chance, tyro.conf.arg(name="async")] = 0.0
+    """share of steps that an agent lets pass, each in its own rhythm."""
+
+    def __post_init__(self):
+        """Refuse nothing yet: a refusal in the parser would be no sentence."""
+
+    def faults(self) -> Faults:
+        """The same as a value; refused before any run is played."""
+        return Faults.of(dataclasses.asdict(self))
+
+
+NO_FAULTS = FaultFlags()
+Wrong = Annotated[tyro.conf.OmitArgPrefixes[FaultFlags], tyro.conf.arg(name="faults")]
