@@ -337,7 +337,7 @@ def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned,
 def test_windows_are_halved_by_the_order_of_logs_and_what_was_foreseen_is_compared_with_what_came(close, cloned):
     store, world = close
     body = Body(radius=0.1, steps=20, every_episode=True)
-    windowed = Windowed.of(store, cloned, world, body, Faults(), 100, 100, 1, True)
+    windowed = Windowed.of(store, cloned, world, body, Faults(), {"calibration": 100, "test": 100}, 1, True)
     first, second = (set(zip(w.episode, w.start)) for w in (windowed.calibration.windows, windowed.test.windows))
     assert first and max(first) < min(second)
     guard = build(Nothing(), world, None, "shield", "learned", margin=-50.0, **SMALL)

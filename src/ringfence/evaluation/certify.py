@@ -101,8 +101,9 @@ def certify(
     body = Body(kinematics, wheelbase, radius, steps, every_episode)
     options = {**options, "guard": guard}
     keep_programs()
-    if logs is None:
-        _refuse_unread(body)
+    unread = [f.name for f in dataclasses.fields(body) if getattr(body, f.name) != f.default]
+    if logs is None and unread:
+        raise UserError(f"{unread[0]} is of replays; give logs=, the store that is replayed, or leave it out.")
     if logs is None and make_env is None:
         check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
     if logs is not None and make_env is not None:
@@ -117,22 +118,24 @@ def certify(
     if make_env is not None:
         trials = Own(make_env, faults, counts, cost, quiet)
     elif logs is not None:
-        world = _guard(resolved).world
-        trials = Windowed.of(logs, resolved.run, world, body, faults, calibration, episodes, least, quiet)
+        trials = Windowed.of(logs, resolved.run, _guard(resolved).world, body, faults, counts, least, quiet)
+    resolved, rounds = _calibrated(run, options, resolved, trials, quantile)
+    return _promised(resolved, faults, rounds, confidence, trials.play(resolved, "test", 1), trials.about)
+
+
+def _calibrated(
+    run: Run | str, options: Mapping[str, Any], resolved: Resolved, trials: Simulated | Windowed | Own, quantile: float
+) -> tuple[Resolved, list[Round]]:
+    """The run under the margin that a fresh batch agrees with, or under the last one that was tried."""
     rounds: list[Round] = []
-    agreed = False
-    while len(rounds) < MAX_ROUNDS and not agreed:
+    while True:
         margin = _guard(resolved).options.margin
         played = trials.play(resolved, "calibration", len(rounds))
         found = conformal(played.shortfall, quantile)
         rounds.append({"margin": margin, "quantile": found, "episodes": len(played.violated)})
-        agreed = found <= margin
-        if not agreed and (len(rounds) == MAX_ROUNDS or margin >= WIDEST):
-            break
-        if not agreed:
-            resolved = _resolved(run, {**options, "margin": round(min(found, WIDEST), 3)})
-    tested = trials.play(resolved, "test", 1)
-    return _promised(resolved, faults, rounds, agreed, confidence, tested, trials.about)
+        if found <= margin or len(rounds) == MAX_ROUNDS or margin >= WIDEST:
+            return resolved, rounds
+        resolved = _resolved(run, {**options, "margin": round(min(found, WIDEST), 3)})
 
 
 def conformal(scores: np.ndarray, quantile: float) -> float:
@@ -201,12 +204,6 @@ def _check(confidence: float, quantile: float, calibration: int, episodes: int) 
     return least
 
 
-def _refuse_unread(body: Body) -> None:
-    given = [f.name for f in dataclasses.fields(body) if getattr(body, f.name) != f.default]
-    if given:
-        raise UserError(f"{given[0]} is of replays; give logs=, the store that is replayed, or leave it out.")
-
-
 def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:
     resolved = resolve(PolicySpec.of(run, **options))
     if resolved.guard is None:
@@ -227,7 +224,6 @@ def _promised(
     resolved: Resolved,
     faults: Faults,
     rounds: list[Round],
-    agreed: bool,
     confidence: float,
     tested: Trials,
     about: dict[str, Any],
@@ -248,7 +244,7 @@ def _promised(
         episodes=episodes,
         violations=violations,
         rounds=tuple(rounds),
-        agreed=agreed,
+        agreed=rounds[-1]["quantile"] <= rounds[-1]["margin"],
         held=float((tested.shortfall <= guard.options.margin).mean()),
         infeasible_rate=tested.infeasible,
         **about,
@@ -366,8 +362,7 @@ class Windowed:
         world: World,
         how: Body,
         faults: Faults,
-        calibration: int,
-        episodes: int,
+        counts: Mapping[Part, int],
         least: int,
         quiet: bool,
     ) -> Windowed:
@@ -377,7 +372,7 @@ class Windowed:
         w = stage.windows
         moment = w.episode * (1 + w.start.max()) + w.start
         first = moment < np.median(moment)  # everybody who is driven in the same moments is in the same half
-        to_calibrate, to_test = _evenly(first, calibration), _evenly(~first, episodes)
+        to_calibrate, to_test = _evenly(first, counts["calibration"]), _evenly(~first, counts["test"])
         if len(to_calibrate) < least:
             raise UserError(
                 f"The first half of these logs has {len(to_calibrate)} windows, and a margin is calibrated on {least} "

@@ -63,13 +63,11 @@ def ope(
 ) -> OPEResult:
     """What logs say of a policy: a run as `ringfence.load` plays it (guard, barrier, execution, world, ...).
 
-    store: logs of the run's task, best those that it was not trained on (`trained_on` of the result says whether it
-    was on any of them, `episodes_trained_on` on how many). `evaluation_world` is the World that predicts (default:
-    fitted to these logs with seed + 1). The policy is asked in `states` logged states; fitted Q evaluation learns from
-    `transitions` logged steps, by `num_ensemble` networks on resampled episodes, whose 95 % interval is Student's;
-    `compare` evaluates what the logs did, too. Policies are asked with an empty carry: plans under way and adapted
-    margins are not there.
-
+    store: logs of the run's task, best those that it was not trained on (the result's `episodes_trained_on` says on how
+    many of them it was). `evaluation_world` is the World that predicts (default: fitted to these logs with seed + 1).
+    The policy is asked in `states` logged states; fitted Q evaluation learns from `transitions` logged steps, by
+    `num_ensemble` networks on resampled episodes, whose 95 % interval is Student's; `compare` evaluates what the logs
+    did, too. Policies are asked with an empty carry: plans under way and adapted margins are not there.
     In `rollout_episodes` of up to `rollout_steps` steps it is played in that World, with its carry (0 episodes: not).
     `ahead` is how many steps are predicted from each logged state.
     """
@@ -78,38 +76,24 @@ def ope(
     run = Run.of(run)
     check(run, store)
     spec = PolicySpec.of(run, planner=planner, **options)
-    if store.card.action_delay and spec.guarded and "delay" not in dict(spec.guard_options):
-        spec = spec.with_guard_options(delay=0)  # undelayed logs, and their World, act at once
-    resolved = resolve(spec)
-    _refuse_without_state(resolved, store)
+    resolved = _resolved(spec, store)
     world = evaluation_world or worlds.fit(store, seed=seed + 1, execution=spec.execution, quiet=quiet)
     if not (world.card.data.content == store.content and world.spec.action_dim == store.actions.shape[2]):
         raise UserError("evaluation_world is of other logs; leave it out, and one is fitted to these.")
-
-    job = resolved.job
-    policy = resolved.policy
-    logs = Logs(job.task.logs(store), world)
-    reads_state = logs.store.state is not None and (job.widths[1] is None or job.widths[1] > 0)
-    ask = Respondent(policy, logs, world, reads_state, ahead, seed)
+    logs = Logs(resolved.job.task.logs(store), world)
+    reads_state = logs.store.state is not None and resolved.job.widths[1] != 0  # None: it does not tell
+    ask = Respondent(resolved.policy, logs, world, reads_state, ahead, seed)
     rng = np.random.default_rng(seed)
     key = jax.random.key(seed)
     asked = np.sort(rng.choice(logs.steps, min(states, logs.steps), replace=False))
     responses = ask(logs.row[asked])
-    played = None
-    if rollout_episodes:
-        rollout_key = jax.random.fold_in(key, 1)
-        played = rollout(policy, logs, world, reads_state, rollout_key, rollout_episodes, rollout_steps)
-
+    played = rollout(ask, jax.random.fold_in(key, 1), rollout_episodes, rollout_steps) if rollout_episodes else None
     learned = rng.choice(logs.steps, min(transitions, logs.steps), replace=False)
     starts = rng.permutation(logs.starts)[:STARTS]
     worth = _Worth(logs, learned, starts, FQE(discount, num_ensemble, updates), key, quiet)
     return OPEResult(
-        task=job.task.name,
-        algorithm=job.algorithm.name,
+        **_about(run, resolved, logs, store),
         guard=spec.guard,
-        logs=LogsRead(logs.episodes, logs.steps, store.content),
-        trained_on=bool(_trained_on(run, store)),
-        episodes_trained_on=_trained_on(run, store),
         discount=discount,
         ahead=ahead,
         behaviour=behaviour(logs, asked, responses, world),
@@ -154,6 +138,29 @@ class _Worth:
     def _fitted(self, following: np.ndarray, first: np.ndarray, label: str) -> Values:
         label = "" if self.quiet else label
         return fitted_q(self.logs, self.learned, following, self.starts, first, self.settings, self.key, label)
+
+
+def _resolved(spec: PolicySpec, store: EpisodeStore) -> Resolved:
+    """Who plays, as the logs want it; refused before a World is fitted to them where they lack what it reads."""
+    if store.card.action_delay and spec.guarded and "delay" not in dict(spec.guard_options):
+        spec = spec.with_guard_options(delay=0)  # undelayed logs, and their World, act at once
+    resolved = resolve(spec)
+    read = [resolved.job.feature_map] + ([] if resolved.guard is None else [resolved.guard.world.map])
+    if store.state is None and any(map.reads_state for map in read):
+        raise UserError("The run reads the global state, and the logs hold none; evaluate it by logs that have it.")
+    return resolved
+
+
+def _about(run: Run, resolved: Resolved, logs: Logs, store: EpisodeStore) -> dict[str, Any]:
+    """Who was evaluated, by which logs."""
+    trained_on = _trained_on(run, store)
+    return {
+        "task": resolved.job.task.name,
+        "algorithm": resolved.job.algorithm.name,
+        "logs": LogsRead(logs.episodes, logs.steps, store.content),
+        "trained_on": bool(trained_on),
+        "episodes_trained_on": trained_on,
+    }
 
 
 def _trained_on(run: Run, store: EpisodeStore) -> int | None:
@@ -204,13 +211,6 @@ def check(run: Run, store: EpisodeStore) -> None:
         raise UserError(
             f"The run is of steps of {here:g} s, the logs of {there:g} s; bring the logs to the run's steps."
         )
-
-
-def _refuse_without_state(resolved: Resolved, store: EpisodeStore) -> None:
-    """Before a World is fitted to them."""
-    read = [resolved.job.feature_map] + ([] if resolved.guard is None else [resolved.guard.world.map])
-    if store.state is None and any(map.reads_state for map in read):
-        raise UserError("The run reads the global state, and the logs hold none; evaluate it by logs that have it.")
 
 
 def _check_names(data: Mapping[str, Any], store: EpisodeStore) -> None:

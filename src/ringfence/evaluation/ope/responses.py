@@ -250,13 +250,12 @@ def _linear(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
     return np.concatenate([slope, weights[-1:] - mean @ slope])
 
 
-def rollout(
-    policy: Any, logs: Logs, world: World, reads_state: bool, key: Key, episodes: int, steps: int
-) -> ModelRollout | None:
+def rollout(ask: Respondent, key: Key, episodes: int, steps: int) -> ModelRollout | None:
     """`episodes` episodes in the World, of `steps` steps or as many as the logged one that begins there has, by
     every member of the ensemble; None where features do not tell what the policy reads."""
+    logs, world = ask.logs, ask.world
     rng = np.random.default_rng(int(jax.random.bits(key)))
-    observe = observer(logs, reads_state, rng)
+    observe = observer(logs, ask.reads_state, rng)
     if observe is None:
         return None
     which = rng.permutation(logs.episodes)[:episodes]
@@ -267,7 +266,7 @@ def rollout(
     played = []
     for member in range(world.dynamics.size):
         member_key = jax.random.fold_in(key, member)
-        played.append(play(policy, observe, world, barrier, starts, jnp.asarray(member), member_key, steps=steps))
+        played.append(play(ask.policy, observe, world, barrier, starts, jnp.asarray(member), member_key, steps=steps))
     earned, unsafe, ood = (np.stack([np.asarray(of_member[k]) for of_member in played]) for k in range(3))
     # As long as the episode that began there was logged: who goes on for longer would earn more by that alone.
     there = np.arange(steps)[:, None] < logs.store.lengths[which]

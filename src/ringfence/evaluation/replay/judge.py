@@ -91,19 +91,25 @@ def replay(
     _check(drivers, guard, windows, steps, seed)
     run = None if policy is None else Run.of(policy)
     logs = Logs.of(store, run)
-    store, names = logs.store, logs.names
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     given: dict[str, Any] = {"barrier": barrier} if barrier else {}
     if world is not None:
         given["world"] = world if isinstance(world, World) else load(world)
     given |= options
-    if compensate:
-        given |= _compensated(run, logs.task, guard, given, anyway, faults)
-    guarded = _guarded(run, logs.task, guard, given, anyway) if guard != "none" else None
-    known_world = guarded.guard.world if guarded is not None else given.get("world")
+    guarded = _guarded(run, logs.task, guard, given, anyway, faults if compensate else None)
+    known_world = given.get("world") if guarded is None else guarded.guard.world
     how = Body(kinematics, wheelbase, radius, steps, every_episode)
     stage, source, left_out = logs.stage(known_world, how, windows, seed, faults)
-    filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
+    notes = _notes(logs, guarded, faults, compensate)
+    filters = _filters(guard, guarded, known_world if baselines else None, stage, notes)
+    shown = _played(stage, _players(run, drivers), filters, baselines, quiet)
+    about = {"task": logs.store.card.task, "radius_from": source, "begun_in_contact": left_out, "notes": tuple(notes)}
+    return _result(stage, shown, guard, known_world, **about)
+
+
+def _notes(logs: Logs, guarded: Guarded | None, faults: Faults, compensate: bool) -> list[str]:
+    """What is to be known of the rows, a sentence or two each."""
+    store, names = logs.store, logs.names
     notes: list[str] = []
     if faults.given:
         known_to = ", which the guard knows" if compensate else ""
@@ -121,25 +127,37 @@ def replay(
     if names.as_logged:
         kept = ", ".join(names.as_logged[:SHOWN]) + (", ..." if len(names.as_logged) > SHOWN else "")
         notes.append(f"Of a driven agent {kept} stay as logged: no name says how they follow from its motion.")
-    if baselines and known_world is not None:
-        formula = _formula(known_world, stage.radius, stage.windows.dt)
-        filters |= {"formula": formula} if formula else {}
-        notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
-    shown = _played(stage, _players(run, drivers), filters, baselines, quiet)
+    return notes
+
+
+def _filters(
+    guard: str, guarded: Guarded | None, world: World | None, stage: Stage, notes: list[str]
+) -> dict[str, Guarded]:
+    """What filters actions, by name: the guard, and a shield that knows the distance, along 2 s; without that, a note,
+    where the World's view does not hold places of others."""
+    filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
+    if world is None:
+        return filters
+    hazard = constraints.Separation(stage.radius, 0.25 * stage.radius)
+    if constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents) is None:
+        notes.append("The World's view holds no places of others: no row by the formula.")
+        return filters
+    rows = int(np.clip(round(LONG / stage.windows.dt), 3, 20))
+    return filters | {"formula": build(Nothing(), world, hazard, "shield", "analytic", {}, horizon=rows)}
+
+
+def _result(stage: Stage, shown: list[Played], guard: str, world: World | None, **about: Any) -> ReplayResult:
     return ReplayResult(
-        task=store.card.task,
         radius=stage.radius,
-        radius_from=source,
         kinematics=stage.kinematics.name,
         steps=stage.windows.steps,
         seconds=stage.windows.steps * stage.windows.dt,
         windows=stage.windows.count,
-        begun_in_contact=left_out,
         guard=guard,
-        verdict=_verdict(known_world),
+        verdict=None if world is None or world.card.verdict is None else world.card.verdict.word,
         rows=tuple(row for one in shown for row in rows_of(stage, one)),
-        notes=tuple(notes),
         films=tuple(film for one in shown if guard in one.under for film in [_film(stage, one, guard)])[:FILMS],
+        **about,
     )
 
 
@@ -220,34 +238,32 @@ def _played(
     return shown
 
 
-def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool) -> Guarded:
-    """The run under guard, or a guard of whatever is proposed."""
+def _guarded(
+    run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool, known: Faults | None = None
+) -> Guarded | None:
+    """The run under guard, or a guard of whatever is proposed; it knows of the faults that are `known`. None where
+    nobody guards."""
+    if known is not None:
+
+        def guard_of(spec: PolicySpec) -> Guard:
+            found = _guarded(run, task, guard, options, anyway)
+            assert found is not None, "compensation without a guard is refused first"
+            return found.guard
+
+        choices = options | {"guard": guard, "anyway": anyway}
+        found = compensated(run, known, choices, guard_of)
+        options = options | {name: value for name, value in found.items() if name not in choices}
+    if guard == "none":
+        return None
     if run is not None:
-        found = resolve(PolicySpec.of(run, guard=guard, anyway=anyway, **options)).policy
-        assert isinstance(found, Guarded), "a guard was named"
-        return found
+        policy = resolve(PolicySpec.of(run, guard=guard, anyway=anyway, **options)).policy
+        assert isinstance(policy, Guarded), "a guard was named"
+        return policy
     spec = PolicySpec.of(guard=guard, anyway=anyway, **options)
     if not isinstance(spec.world, World):
         raise UserError("Nothing says which World guards; give world=, e.g. ringfence.fit(store), or a run.")
     changes = dict(spec.guard_options)
     return build(Nothing(), spec.world, task.hazard, guard, spec.barrier, anyway=anyway, **changes)
-
-
-def _compensated(
-    run: Run | None, task: Task, guard: str, given: dict[str, Any], anyway: bool, faults: Faults
-) -> dict[str, Any]:
-    """Options of a guard that knows of faults, beside those that it is given."""
-
-    def guard_of(spec: PolicySpec) -> Guard:
-        return _guarded(run, task, guard, given, anyway).guard
-
-    choices = given | {"guard": guard, "anyway": anyway}
-    found = compensated(run, faults, choices, guard_of)
-    return {name: value for name, value in found.items() if name not in choices}
-
-
-def _verdict(world: World | None) -> str | None:
-    return None if world is None or world.card.verdict is None else world.card.verdict.word
 
 
 def _check(drivers: Sequence[str], guard: str, windows: int, steps: int | None, seed: int) -> None:
@@ -405,15 +421,6 @@ def _radius_of_causes(causes: Mapping[str, Found], axes: int) -> tuple[float, st
         return None
     _, radius, name = likely[-1]
     return radius, f"the World's cause '{name}'; other dangers are not counted"
-
-
-def _formula(world: World, radius: float, dt: float) -> Guarded | None:
-    """A shield that knows the distance, along 2 s; None where the World's view does not hold places of others."""
-    hazard = constraints.Separation(radius, 0.25 * radius)
-    if constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents) is None:
-        return None
-    rows = int(np.clip(round(LONG / dt), 3, 20))
-    return build(Nothing(), world, hazard, "shield", "analytic", {}, horizon=rows)
 
 
 def rows_of(stage: Stage, played: Played) -> list[Row]:
