@@ -137,7 +137,26 @@ class Certificate:
             if stored.pop("digest", None) != _digest_of_words(stored):
                 raise ValueError("it is not what was written: its digest is of other contents")
             found = schemas.check({name: value for name, value in stored.items() if name != "says"}, cls)
-            _check_sense(found)
+            # `ValueError` where it promises what its counts do not tell, or is of a guard that there is not.
+            if found.violations > found.episodes:
+                raise ValueError(f"{found.violations} of {found.episodes} episodes violated")
+            bound = upper_bound(found.violations, found.episodes, found.confidence)
+            if abs(bound - found.bound) > CLOSE:
+                raise ValueError(
+                    f"{found.violations} of {found.episodes} violations are a bound of {bound:.4g} with confidence "
+                    f"{found.confidence:g}, not {found.bound:.4g}"
+                )
+            if found.barrier not in SOURCES:
+                raise ValueError(f"it is of barrier='{found.barrier}', which there is not")
+            for kind, options in ((GuardOptions, found.guard), (Faults, found.faults)):
+                lacking = fields_of(kind).keys() - options.keys()
+                if lacking:
+                    raise ValueError(f"it does not say {sorted(lacking)[0]}")
+                if dataclasses.asdict(build_config(kind, options, "the certificate")) != options:
+                    raise ValueError("its options are of other types")
+            last = found.rounds[-1]
+            if found.guard["margin"] != last["margin"] or found.agreed != (last["quantile"] <= last["margin"]):
+                raise ValueError(f"margin={found.guard['margin']} is not the one that its last batch was played with")
         except (ValueError, OSError) as error:
             raise UserError(
                 f"'{path}' is no certificate ({str(error).rstrip('.')}); make one with `ringfence certify`."
@@ -169,29 +188,6 @@ def digest(tree: Any) -> str:
 def _digest_of_words(content: Mapping[str, Any]) -> str:
     """Of everything that a file says."""
     return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
-
-
-def _check_sense(found: Certificate) -> None:
-    """`ValueError` where it promises what its counts do not tell, or is of a guard that there is not."""
-    if found.violations > found.episodes:
-        raise ValueError(f"{found.violations} of {found.episodes} episodes violated")
-    bound = upper_bound(found.violations, found.episodes, found.confidence)
-    if abs(bound - found.bound) > CLOSE:
-        raise ValueError(
-            f"{found.violations} of {found.episodes} violations are a bound of {bound:.4g} with confidence "
-            f"{found.confidence:g}, not {found.bound:.4g}"
-        )
-    if found.barrier not in SOURCES:
-        raise ValueError(f"it is of barrier='{found.barrier}', which there is not")
-    for kind, options in ((GuardOptions, found.guard), (Faults, found.faults)):
-        lacking = fields_of(kind).keys() - options.keys()
-        if lacking:
-            raise ValueError(f"it does not say {sorted(lacking)[0]}")
-        if dataclasses.asdict(build_config(kind, options, "the certificate")) != options:
-            raise ValueError("its options are of other types")
-    last = found.rounds[-1]
-    if found.guard["margin"] != last["margin"] or found.agreed != (last["quantile"] <= last["margin"]):
-        raise ValueError(f"margin={found.guard['margin']} is not the one that its last batch was played with")
 
 
 class Monitor:

@@ -16,7 +16,6 @@ from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.training import worlds
 from ringfence.training.runs import Run
-from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
@@ -106,7 +105,7 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "guard_options": {} if guard is None else dataclasses.asdict(guard.options),
         **({} if guard is None else _of_world(guard.world.card)),
         "train_seconds": sum(r["seconds"] for r in run.metrics),
-        "parameters": _parameters(resolved.policy),
+        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(resolved.policy))),
     }
 
 
@@ -114,7 +113,3 @@ def _of_world(card: Card) -> dict[str, Any]:
     """What a result says of the World that a guard asks; one of before has no verdict."""
     verdict = {} if card.verdict is None else {"verdict": card.verdict.word}
     return {"world_settings": dataclasses.asdict(card.settings), **verdict}
-
-
-def _parameters(policy: Policy) -> int:
-    return int(sum(np.size(x) for x in jax.tree.leaves(policy)))

@@ -98,9 +98,7 @@ def play(
     return shown | about | {"cost_limit": player.task.cost_limit}
 
 
-def _check(
-    episodes: int, num_envs: int, seed: int, max_episode_steps: int | None, early_ends: str, split: str
-) -> None:
+def _check(episodes: int, num_envs: int, seed: int, max_episode_steps: int | None, early_ends: str, split: str) -> None:
     whole_number("episodes", episodes, 1)
     whole_number("num_envs", num_envs, 1)
     whole_number("seed", seed, 0, LAST_SEED)
@@ -168,9 +166,7 @@ def _names_of(player: Player, env: Any) -> Names:
     return Names.of(player.observation_names, states or (), len(env.possible_agents))
 
 
-def _keep(
-    player: RunPlayer, episodes: int, result: dict[str, Any], how: dict[str, Any], film: Recording
-) -> None:
+def _keep(player: RunPlayer, episodes: int, result: dict[str, Any], how: dict[str, Any], film: Recording) -> None:
     """Add a result to the run, with the command that makes it again, and the film beside it."""
     words = ["--env", how["simulator"], "--episodes", episodes, "--num-envs", how["num_envs"]]
     words += [] if how["early_ends"] == "refuse" else ["--early-ends", how["early_ends"]]

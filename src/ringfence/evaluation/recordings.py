@@ -46,7 +46,31 @@ def read(folder: Path, variant: str) -> Recording | None:
         return None
     try:
         arrays = read_npz(within(folder, file))
-        _check(arrays)
+        # Whoever shows a recording relies on its shapes.
+        axes = {"costs": 2, "rewards": 2} | ({"places": 4, "resting": 3} if "places" in arrays else {"states": 3})
+        axes |= {name: count for name, count in (("plans", 6), ("agent_costs", 3)) if name in arrays}
+        for name, wanted in axes.items():
+            if name not in arrays or arrays[name].ndim != wanted:
+                raise ValueError(f"it holds no '{name}' of {wanted} axes")
+        episodes, steps = arrays["costs"].shape
+        if not episodes or not steps:
+            raise ValueError("it holds no episode")
+        wanted_sizes = {name: (episodes, steps) for name in axes}
+        wanted_sizes |= {"states": (episodes, steps + 1), "places": (episodes, steps + 1), "resting": (episodes,)}
+        if "chosen" in arrays:
+            wanted_sizes["chosen"] = (episodes, steps)
+        for name, sizes in wanted_sizes.items():
+            if name in arrays and arrays[name].shape[: len(sizes)] != sizes:
+                raise ValueError(f"'{name}' begins with {arrays[name].shape[: len(sizes)]}, not with {sizes}")
+        if "places" in arrays:
+            # Refuse places that are not of agents on a plane.
+            places = arrays["places"]
+            if not places.shape[2] or places.shape[3] != 2 or arrays["resting"].shape[2] != 2:
+                raise ValueError("its places are not pairs of numbers")
+            if "agent_costs" in arrays and arrays["agent_costs"].shape[2] != places.shape[2]:
+                raise ValueError("it has costs of another number of agents than places")
+            if not np.isfinite(places[:, 0]).all() or not np.isfinite(arrays["resting"]).all():
+                raise ValueError("nobody knows where its episodes begin")
     except ValueError as error:
         raise UserError(f"'{file}' is damaged ({error}); evaluate the run again or delete the file.") from error
     return arrays
@@ -56,38 +80,6 @@ def kept(folder: Path, variant: str, kind: str) -> Path | None:
     """The recording (npz) or the film (gif) of a variant, if there is one."""
     file = folder / f"rollout-{variant}.{kind}"
     return file if file.exists() else None
-
-
-def _check(arrays: Recording) -> None:
-    """Whoever shows a recording relies on its shapes."""
-    axes = {"costs": 2, "rewards": 2} | ({"places": 4, "resting": 3} if "places" in arrays else {"states": 3})
-    axes |= {name: count for name, count in (("plans", 6), ("agent_costs", 3)) if name in arrays}
-    for name, wanted in axes.items():
-        if name not in arrays or arrays[name].ndim != wanted:
-            raise ValueError(f"it holds no '{name}' of {wanted} axes")
-    episodes, steps = arrays["costs"].shape
-    if not episodes or not steps:
-        raise ValueError("it holds no episode")
-    wanted_sizes = {name: (episodes, steps) for name in axes}
-    wanted_sizes |= {"states": (episodes, steps + 1), "places": (episodes, steps + 1), "resting": (episodes,)}
-    if "chosen" in arrays:
-        wanted_sizes["chosen"] = (episodes, steps)
-    for name, sizes in wanted_sizes.items():
-        if name in arrays and arrays[name].shape[: len(sizes)] != sizes:
-            raise ValueError(f"'{name}' begins with {arrays[name].shape[: len(sizes)]}, not with {sizes}")
-    if "places" in arrays:
-        _check_places(arrays)
-
-
-def _check_places(arrays: Recording) -> None:
-    """Refuse places that are not of agents on a plane."""
-    places = arrays["places"]
-    if not places.shape[2] or places.shape[3] != 2 or arrays["resting"].shape[2] != 2:
-        raise ValueError("its places are not pairs of numbers")
-    if "agent_costs" in arrays and arrays["agent_costs"].shape[2] != places.shape[2]:
-        raise ValueError("it has costs of another number of agents than places")
-    if not np.isfinite(places[:, 0]).all() or not np.isfinite(arrays["resting"]).all():
-        raise ValueError("nobody knows where its episodes begin")
 
 
 class Places:

@@ -72,7 +72,8 @@ def rollout(
     act_key = jax.random.fold_in(jax.random.key(root + 1), seed)
     label = label or "evaluating"
     if isinstance(env, NativeEnv):
-        return _rollout_native(policy, env, episodes, root, act_key, num_recorded, label, quiet, foreseen)
+        with Progress(label, env.episode_length, 0, quiet) as bar:
+            return _rollout_native(policy, env, episodes, root, act_key, num_recorded, foreseen, bar)
     if _foreign(policy):
         raise UserError(
             f"Simple Spread runs inside JAX, and {type(policy).__name__} is no pytree; make it an equinox.Module whose "
@@ -164,9 +165,8 @@ def _rollout_native(
     root: int,
     key: Key,
     num_recorded: int,
-    label: str,
-    quiet: bool,
     foreseen: bool,
+    bar: Progress,
 ) -> Played:
     """`rollout` on a simulator that steps outside JAX: all episodes side by side. After an episode's end its rewards
     and costs are 0 and its state stays."""
@@ -188,8 +188,7 @@ def _rollout_native(
         bar.advance(1)
 
     keys = (jax.random.fold_in(key, t) for t in range(env.episode_length))
-    with Progress(label, env.episode_length, 0, quiet) as bar:
-        outside.rollout(Acting(policy), simulation, keep, keys)
+    outside.rollout(Acting(policy), simulation, keep, keys)
     played = _stacked(steps)
     states = np.stack([one.state for one in seen if one.state is not None], 1)  # robots have one
     return {

@@ -293,6 +293,9 @@ def fitted_q(
     earned = np.stack([logs.rewards[steps], logs.costs[steps]], -1).astype(np.float64)
     mean = earned.mean(0)
     deviation = np.maximum(earned.std(0), 1e-6)
+    # (T, M): how often each member drew the episode of a step.
+    episodes, which = np.unique(logs.episode[steps], return_inverse=True)
+    rng = np.random.default_rng(int(jax.random.bits(weight_key)))
     data = Steps(
         x=view(logs.row[steps]),
         action=on_device(logs.actions[steps]),
@@ -300,9 +303,13 @@ def fitted_q(
         next_action=on_device(next_actions),
         earned=on_device((earned - mean) / deviation * (1 - settings.discount), np.float32),
         goes_on=on_device(~logs.terminated[steps], np.float32),
-        weight=on_device(_bootstrap(logs.episode[steps], settings.num_ensemble, weight_key), np.float32),
+        weight=on_device(rng.poisson(1.0, (len(episodes), settings.num_ensemble))[which], np.float32),
     )
-    nets = _networks(data, logs.joint, settings.num_ensemble, net_key)
+    agents, actions = data.next_action.shape[1:]
+    sizes = (data.x.shape[-1] + (agents * actions if logs.joint else actions), WIDTH, WIDTH, 2)
+    nets = jax.vmap(lambda k: Q(MLP(k, sizes, linear=True), logs.joint))(
+        jax.random.split(net_key, settings.num_ensemble)
+    )
     # What ends for good earns nothing more, and nothing is −mean in these units.
     fast = _fitted(nets, data, on_device(-mean / deviation, np.float32), settings, fit_key, label)
     at_starts = jax.jit(lambda nets, x, action: jax.vmap(lambda q: q(x, action).mean(0))(nets))
@@ -321,19 +328,6 @@ def _bounded(found: np.ndarray, always: np.ndarray) -> Mean:
     if not (np.isfinite(found).all() and low - slack <= found.mean() <= high + slack):
         return UNKNOWN
     return Mean.of_bootstrap(found)
-
-
-def _bootstrap(episode_of_step: np.ndarray, num_ensemble: int, key: Key) -> np.ndarray:
-    """(T, M): how often each member drew the episode of a step."""
-    episodes, which = np.unique(episode_of_step, return_inverse=True)
-    rng = np.random.default_rng(int(jax.random.bits(key)))
-    return rng.poisson(1.0, (len(episodes), num_ensemble))[which]
-
-
-def _networks(data: Steps, joint: bool, num_ensemble: int, key: Key) -> Q:
-    agents, actions = data.next_action.shape[1:]
-    sizes = (data.x.shape[-1] + (agents * actions if joint else actions), WIDTH, WIDTH, 2)
-    return jax.vmap(lambda k: Q(MLP(k, sizes, linear=True), joint))(jax.random.split(key, num_ensemble))
 
 
 def _fitted(nets: Q, data: Steps, nothing: Array, settings: FQE, key: Key, label: str) -> Q:

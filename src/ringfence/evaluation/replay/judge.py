@@ -102,7 +102,8 @@ def replay(
     stage, source, left_out = logs.stage(known_world, how, windows, seed, faults)
     notes = _notes(logs, guarded, faults, compensate)
     filters = _filters(guard, guarded, known_world if baselines else None, stage, notes)
-    shown = _played(stage, _players(run, drivers), filters, baselines, quiet)
+    own: dict[str, str | Policy] = {} if run is None else {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy}
+    shown = _played(stage, own | {name: name for name in drivers}, filters, baselines, quiet)
     about = {"task": logs.store.card.task, "radius_from": source, "begun_in_contact": left_out, "notes": tuple(notes)}
     return _result(stage, shown, guard, known_world, **about)
 
@@ -199,9 +200,22 @@ class Logs:
             check_view(world, self.store)
         motion = motion_of(self.store, self.names)
         radius, source = radius_of(self.store, motion, how.radius, {} if world is None else world.card.causes)
-        stage, left_out = _stage(self.store, self.names, motion, world, how, radius, windows, seed)
-        late = dataclasses.replace(faults, delay=faults.delay + self.store.card.action_delay)  # as whoever was logged
-        return dataclasses.replace(stage, faults=late), source, left_out
+        card = self.store.card
+        if card.dt is None:
+            raise UserError(f"The card of '{card.task}' does not say how long a step takes; give it dt (s).")
+        dt = float(card.dt)
+        chosen = np.arange(self.store.episodes) if how.every_episode else _unlearned(world, self.store)
+        longest = int(np.median(self.store.lengths[chosen]))
+        if how.steps is None and round(SECONDS / dt) < 2:
+            raise UserError(
+                f"A step of '{card.task}' is {dt:g} s, and a window has {SECONDS:g} s; say how many steps it has "
+                "(--steps, steps=)."
+            )
+        steps = how.steps or max(1, min(round(SECONDS / dt), longest))
+        cut, left_out = windows_of(self.store, self.names, motion, chosen, steps, windows, radius, dt)
+        body = kinematics_of(how.kinematics, self.store, motion, world, dt, how.wheelbase)
+        late = dataclasses.replace(faults, delay=faults.delay + card.action_delay)  # as whoever was logged
+        return Stage(cut, body, radius, seed, late), source, left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,12 +225,6 @@ class Played:
     name: str
     plain: Driven
     under: dict[str, Driven]
-
-
-def _players(run: Run | None, drivers: Sequence[str]) -> dict[str, str | Policy]:
-    """Who drives, by name: the run first."""
-    bad: dict[str, str | Policy] = {name: name for name in drivers}
-    return bad if run is None else {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy} | bad
 
 
 def _played(
@@ -319,33 +327,6 @@ def check_view(world: World, store: EpisodeStore) -> None:
         raise UserError(
             f"The World steps by {world.map.dt:g} s, these logs by {store.card.dt:g} s; import them with that dt."
         )
-
-
-def _stage(
-    store: EpisodeStore,
-    names: Names,
-    motion: Motion,
-    world: World | None,
-    how: Body,
-    radius: float,
-    most: int,
-    seed: int,
-) -> tuple[Stage, int]:
-    """The stage, and how many windows begin in contact."""
-    if store.card.dt is None:
-        raise UserError(f"The card of '{store.card.task}' does not say how long a step takes; give it dt (s).")
-    dt = float(store.card.dt)
-    chosen = np.arange(store.episodes) if how.every_episode else _unlearned(world, store)
-    longest = int(np.median(store.lengths[chosen]))
-    if how.steps is None and round(SECONDS / dt) < 2:
-        raise UserError(
-            f"A step of '{store.card.task}' is {dt:g} s, and a window has {SECONDS:g} s; say how many steps it has "
-            "(--steps, steps=)."
-        )
-    steps = how.steps or max(1, min(round(SECONDS / dt), longest))
-    cut, left_out = windows_of(store, names, motion, chosen, steps, most, radius, dt)
-    body = kinematics_of(how.kinematics, store, motion, world, dt, how.wheelbase)
-    return Stage(cut, body, radius, seed), left_out
 
 
 def _unlearned(world: World | None, store: EpisodeStore) -> np.ndarray:
