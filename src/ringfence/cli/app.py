@@ -181,10 +181,10 @@ def evaluate(
     found = _some_runs(runs)
     if video:
         from ringfence.loading.resolve import load_job
-        from ringfence.report.video import check
+        from ringfence.report import video as films
 
         for run in {run.config["task"]: run for run in found}.values():
-            check(load_job(run).task)
+            films.check(load_job(run).task)
         num_recorded = num_recorded or 1
     given |= {
         "episodes": episodes,
@@ -212,7 +212,7 @@ def evaluate(
             table.add_row(*_evaluated(run, result))
             doubts += _doubt(result)
             if video:
-                print(_film(run, result["variant"]))
+                print(films.film(run, result["variant"]))
     _say(table, refusals, len(found), doubts)
 
 
@@ -229,6 +229,10 @@ def _doubt(result: dict[str, Any]) -> list[str]:
 
 def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
     """A result's row of the table."""
+    from ringfence.datasets.registry import TASKS
+
+    task = TASKS.get(result["task"])
+    usual_size = task is None or result["agents"] == task.simulator.n_agents
     return [
         terminal(run.path),
         terminal(result["variant"]),
@@ -237,24 +241,10 @@ def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
         f"{result['cost_safe_start']:.3f}",
         f"{result['violation_rate']:.3f} (≤ {result['violation_upper']:.3f})",
         # Constants are those of the logs' team.
-        f"{result['return_norm']:.3f}" if _of_usual_size(result) else "–",
+        f"{result['return_norm']:.3f}" if usual_size else "–",
         f"{result['cost_norm']:.3f}",
         f"{100 * result['termination_rate']:.0f} %",
     ]
-
-
-def _film(run: Run, variant: str) -> Path:
-    from ringfence.report.video import film
-
-    return film(run, variant)
-
-
-def _of_usual_size(result: dict[str, Any]) -> bool:
-    """Whether as many agents played as a task's constants are of."""
-    from ringfence.datasets.registry import TASKS
-
-    task = TASKS.get(result["task"])
-    return task is None or result["agents"] == task.simulator.n_agents
 
 
 def play(

@@ -297,7 +297,10 @@ class _TrainedRun:
             )
         whole = None if state is None else given_as("state", state, (state_width,), origins=origins.state)
         if None in self.job.widths:
-            self._reaches(seen, whole)
+            # Refuse arrays too short for the entries that the run reads.
+            beyond = self.job.feature_map.beyond(seen.shape[-1], None if whole is None else len(whole))
+            if beyond is not None:
+                raise UserError(f"This run reads {beyond}; pass what its data holds.")
         return seen, whole
 
     @in_float32
@@ -305,12 +308,6 @@ class _TrainedRun:
         if cost is not None:
             carry = with_cost(self.policy, carry, cost)
         return self._act(self.policy, carry, *_batch(seen), key)
-
-    def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
-        """Refuse arrays too short for the entries that the run reads."""
-        beyond = self.job.feature_map.beyond(seen.shape[-1], None if state is None else len(state))
-        if beyond is not None:
-            raise UserError(f"This run reads {beyond}; pass what its data holds.")
 
 
 class _Function:

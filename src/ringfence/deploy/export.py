@@ -460,7 +460,18 @@ def _either(first: Array, one: Array, other: Any) -> Array:
 
 def _trace(job: Job, policy: Policy) -> _Traced:
     """A policy's programs, before anything is left out."""
-    seen = _seen(job, policy)
+    # What a policy may be given of one environment at every step.
+    width, state_width = job.widths
+    if width is None or state_width is None:
+        raise UserError(
+            "This run does not tell how wide its observations and state are, and a file has to; train it again."
+        )
+    num_constraints = len(constraints_of(policy))
+    shapes: dict[str, tuple[int, ...]] = {"observations": (job.team, width)}
+    if state_width:
+        shapes["state"] = (state_width,)
+    shapes["cost"] = (num_constraints,) if num_constraints else ()
+    seen = {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in shapes.items()}
     carry = policy.initial_state(1)
     leaves, structure = jax.tree.flatten(carry)
     constraints = constraints_of(policy)
@@ -487,21 +498,6 @@ def _trace(job: Job, policy: Policy) -> _Traced:
     given = jax.make_jaxpr(act_given)(key, *seen.values(), *noise.values(), *leaves)
     names = [f"memory.{name}" for name, _ in named_leaves(carry)]
     return _Traced(drawing, given, seen, noise, dict(zip(names, leaves)), list(results))
-
-
-def _seen(job: Job, policy: Policy) -> dict[str, jax.ShapeDtypeStruct]:
-    """What a policy may be given of one environment at every step."""
-    width, state_width = job.widths
-    if width is None or state_width is None:
-        raise UserError(
-            "This run does not tell how wide its observations and state are, and a file has to; train it again."
-        )
-    num_constraints = len(constraints_of(policy))
-    shapes: dict[str, tuple[int, ...]] = {"observations": (job.team, width)}
-    if state_width:
-        shapes["state"] = (state_width,)
-    shapes["cost"] = (num_constraints,) if num_constraints else ()
-    return {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in shapes.items()}
 
 
 def _drawn(traced: _Traced, key: Key) -> list[Array]:

@@ -17,7 +17,6 @@ import numpy as np
 import ringfence
 from ringfence.errors import UserError, known
 from ringfence.evaluation.certificate import Certificate, Monitor, digest
-from ringfence.guards.policy import Guarded
 from ringfence.guards.wrap import Callback, guarded_of, with_guarded
 from ringfence.problem.homogeneous import agent_policy
 from ringfence.types import Spec
@@ -46,7 +45,25 @@ class Evidence:
         self._parts = () if guarded is None else guarded.guard.barrier.part_names
         self._log = ChainedLog(path)
         try:
-            self._log.add(_begun(policy, guarded, agents, certificate))
+            proposal = agent_policy(policy) if guarded is None else guarded.proposal
+            found: dict[str, Any] = {
+                "kind": "begin",
+                "t": _now(),
+                "ringfence": ringfence.__version__,
+                "agents": agents,
+                "policy": None if isinstance(policy, Callback) else digest(proposal),
+                "world": None,
+                "guard": None,
+                "certificate": None if certificate is None else certificate.digest,
+            }
+            if guarded is not None:
+                guard = guarded.guard
+                found |= {
+                    "world": digest(guard.world),
+                    "barrier": guard.barrier.source,
+                    "guard": dataclasses.asdict(guard.options),
+                }
+            self._log.add(found)
         except BaseException:
             self._log.close()
             raise
@@ -82,7 +99,22 @@ class Evidence:
             "executed": _numbers(action),
         }
         if "agent_requested" in info:
-            record["corrected"] = self._corrected(action, info)
+            # Of each agent whose action is another than it requested: that one, and the worst along its plan.
+            requested = info["agent_requested"]
+            found = []
+            for agent in np.flatnonzero((np.abs(requested - action) > FEW).any(-1)).tolist():
+                constraint, thing = self._parts[int(info["agent_reason"][agent])]
+                found.append(
+                    {
+                        "agent": agent,
+                        "requested": _numbers(requested[agent]),
+                        "constraint": constraint,
+                        "thing": thing,
+                        "row": int(info["agent_reason_row"][agent]),
+                        "score": _numbers(info["agent_reason_score"][agent]),
+                    }
+                )
+            record["corrected"] = found
         if "agent_clearance" in info:
             record["clearance"] = _numbers(info["agent_clearance"])
             record["infeasible"] = np.flatnonzero(info["agent_infeasible"]).tolist()
@@ -103,24 +135,6 @@ class Evidence:
         finally:  # on a full disk, too
             self._log.close()
 
-    def _corrected(self, action: np.ndarray, info: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-        """Of each agent whose action is another than it requested: that one, and the worst along its plan."""
-        requested = info["agent_requested"]
-        found = []
-        for agent in np.flatnonzero((np.abs(requested - action) > FEW).any(-1)).tolist():
-            constraint, thing = self._parts[int(info["agent_reason"][agent])]
-            found.append(
-                {
-                    "agent": agent,
-                    "requested": _numbers(requested[agent]),
-                    "constraint": constraint,
-                    "thing": thing,
-                    "row": int(info["agent_reason_row"][agent]),
-                    "score": _numbers(info["agent_reason_score"][agent]),
-                }
-            )
-        return found
-
 
 def explaining(policy: Any) -> Any:
     """The policy, whose guard says what was requested and what was amiss with it."""
@@ -128,28 +142,6 @@ def explaining(policy: Any) -> Any:
     if guarded is None:
         return policy
     return with_guarded(policy, dataclasses.replace(guarded, explains=True))
-
-
-def _begun(policy: Any, guarded: Guarded | None, agents: int, certificate: Certificate | None) -> dict[str, Any]:
-    proposal = agent_policy(policy) if guarded is None else guarded.proposal
-    found: dict[str, Any] = {
-        "kind": "begin",
-        "t": _now(),
-        "ringfence": ringfence.__version__,
-        "agents": agents,
-        "policy": None if isinstance(policy, Callback) else digest(proposal),
-        "world": None,
-        "guard": None,
-        "certificate": None if certificate is None else certificate.digest,
-    }
-    if guarded is not None:
-        guard = guarded.guard
-        found |= {
-            "world": digest(guard.world),
-            "barrier": guard.barrier.source,
-            "guard": dataclasses.asdict(guard.options),
-        }
-    return found
 
 
 def _numbers(x: np.ndarray) -> Any:

@@ -71,7 +71,13 @@ class PolicySpec:
         _known("execution", execution or "centralized", EXECUTIONS)
         if barrier is not None:
             _known("barrier", barrier, SOURCES)
-        of_plans, of_guard = _by_owner(options)
+        guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
+        plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
+        for name in options:
+            if name not in guard_names + plan_names:
+                raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
+        of_plans = {name: value for name, value in options.items() if name not in guard_names}
+        of_guard = {name: value for name, value in options.items() if name in guard_names}
         if agents is not None:
             whole_number("agents", agents, 1, 100_000)
         spec = cls(
@@ -159,17 +165,6 @@ def _refuse_unread(**choices: Any) -> None:
     for name, given in choices.items():
         if given is not None:
             raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
-
-
-def _by_owner(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The options of PlanOptions, and those of GuardOptions; others are refused."""
-    guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
-    plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
-    for name in options:
-        if name not in guard_names + plan_names:
-            raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
-    of_plans = {name: value for name, value in options.items() if name not in guard_names}
-    return of_plans, {name: value for name, value in options.items() if name in guard_names}
 
 
 def _known(kind: str, name: Any, known: Any) -> None:

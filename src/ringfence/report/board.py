@@ -7,6 +7,7 @@ tasks.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -99,33 +100,31 @@ def read(folder: str | Path) -> Board:
     tasks = sorted(named, key=lambda t: (known.index(t) if t in known else len(known), t))
     jobs = {_job(place.task, place.job) for place in places}
     missing = _missing(about["suite"], places, finished, tasks)
-    return Board(
-        path=folder,
-        suite=about["suite"],
-        protocol=about["protocol"],
-        split=about["split"],
-        episodes=about["episodes"],
-        sections=_sections(tasks, found, [row for row in rows if row.run is None]),
-        seeds=tuple(sorted({place.seed for place in places})),
-        missing=sorted(missing, key=lambda m: (tasks.index(m.task), m.job, m.seed)),
-        unstarted=[e.name for e in _suite(about["suite"]) if _entry_job(e) not in jobs],
-        untouched=[t for t in _suite_tasks(about["suite"]) if t not in named],
-    )
-
-
-def _sections(tasks: list[str], rows: list[Row], references: list[Row]) -> dict[str, Section]:
-    """By task, its lines ranked, in the same colours everywhere."""
-    methods = methods_of(rows)
+    # By task, its lines ranked, in the same colours everywhere.
+    references = [row for row in rows if row.run is None]
+    methods = methods_of(found)
     made = {}
     for task in tasks:
-        mine, beside = ([row for row in some if row.task == task] for some in (rows, references))
+        mine, beside = ([row for row in some if row.task == task] for some in (found, references))
         made[task] = section(task, mine, beside, methods)
     lines = [line for each in made.values() for line in each.lines]
     order = _methods(made.values())
     paint(sorted(lines, key=lambda line: order.index(line.method) if line.method else 0))
     for each in made.values():
         each.tables = {split: ranked(lines, each.constants["cost_limit"]) for split, lines in each.tables.items()}
-    return made
+    suite = suites.SUITES.get(about["suite"])
+    return Board(
+        path=folder,
+        suite=about["suite"],
+        protocol=about["protocol"],
+        split=about["split"],
+        episodes=about["episodes"],
+        sections=made,
+        seeds=tuple(sorted({place.seed for place in places})),
+        missing=sorted(missing, key=lambda m: (tasks.index(m.task), m.job, m.seed)),
+        unstarted=[e.name for e in (suite.entries if suite else ()) if _entry_job(e) not in jobs],
+        untouched=[t for t in (suite.tasks if suite else ()) if t not in named],
+    )
 
 
 def _methods(sections: Iterable[Section]) -> list[Method]:
@@ -157,14 +156,21 @@ def _by_default(row: Row) -> Row:
 
 def _missing(suite: str, places: list[Place], finished: list[Place], tasks: list[str]) -> list[Missing]:
     """What the grid lacks: evaluations of finished cells, cells without any, and cells that were not begun."""
-    partial = [m for place in finished if (m := _partial(suite, place))]
+    found = [lacking for place in finished if (lacking := _partial(suite, place))]
     done = {_cell(place) for place in finished}
-    unfinished = [_unfinished(place) for place in places if _cell(place) not in done]
+    for place in places:
+        if _cell(place) not in done:
+            state, reason = _status(place.path)
+            found.append(Missing(place.task, place.job, place.seed, f"{state}: {reason}" if reason else state))
     begun = {_cell(place) for place in places}
     jobs = sorted({job for _, job, _ in begun})
     seeds = sorted({place.seed for place in places})
-    grid = [(task, job, seed) for task in tasks for job in jobs for seed in seeds if _planned(suite, task, job)]
-    return partial + unfinished + [Missing(*cell, "not started") for cell in grid if cell not in begun]
+    for task, job in itertools.product(tasks, jobs):
+        # Jobs that the suite does not know are expected on every task.
+        entries = [e for e in _suite(suite) if _entry_job(e) == job]
+        if not entries or any(e.plays(_tier(task)) for e in entries):
+            found += [Missing(task, job, seed, "not started") for seed in seeds if (task, job, seed) not in begun]
+    return found
 
 
 def _cell(place: Place) -> tuple[str, str, int]:
@@ -176,17 +182,14 @@ def _partial(suite: str, cell: Place) -> Missing | None:
     """What a cell with results lacks, if anything."""
     state, reason = _status(cell.path)
     if state == "failed":
-        why = f"not every evaluation is there, one failed: {reason}"
-    elif lacking := _lacking(suite, cell):
-        why = f"not every evaluation is there: {', '.join(lacking)}"
-    else:
+        return Missing(cell.task, cell.job, cell.seed, f"not every evaluation is there, one failed: {reason}")
+    known = {result.get("spec") for result in Run(cell.path).results.values()}
+    _, job, _ = _cell(cell)
+    entries = [e for e in _suite(suite) if _entry_job(e) == job and e.plays(_tier(cell.task))]
+    lacking = [name for e in entries for name in e.evaluations if name not in known]
+    if not lacking:
         return None
-    return Missing(cell.task, cell.job, cell.seed, why)
-
-
-def _unfinished(cell: Place) -> Missing:
-    state, reason = _status(cell.path)
-    return Missing(cell.task, cell.job, cell.seed, f"{state}: {reason}" if reason else state)
+    return Missing(cell.task, cell.job, cell.seed, f"not every evaluation is there: {', '.join(lacking)}")
 
 
 def _status(path: Path) -> tuple[str, str]:
@@ -215,27 +218,9 @@ def _suite(name: str) -> tuple[suites.Entry, ...]:
     return suites.SUITES[name].entries if name in suites.SUITES else ()
 
 
-def _suite_tasks(name: str) -> tuple[str, ...]:
-    return suites.SUITES[name].tasks if name in suites.SUITES else ()
-
-
 def _entry_job(entry: suites.Entry) -> str:
     """The folder's name of a suite's entry, as `_job` has it."""
     return entry.algorithm if entry.preset in ("", "default") else f"{entry.algorithm}-{entry.preset}"
-
-
-def _planned(suite: str, task: str, job: str) -> bool:
-    """Whether the suite has this job on this task; jobs it does not know are expected on every task."""
-    entries = [e for e in _suite(suite) if _entry_job(e) == job]
-    return not entries or any(e.plays(_tier(task)) for e in entries)
-
-
-def _lacking(suite: str, cell: Place) -> list[str]:
-    """Evaluations of the suite that a run does not have."""
-    known = {result.get("spec") for result in Run(cell.path).results.values()}
-    _, job, _ = _cell(cell)
-    entries = [e for e in _suite(suite) if _entry_job(e) == job and e.plays(_tier(cell.task))]
-    return [name for e in entries for name in e.evaluations if name not in known]
 
 
 @dataclass(frozen=True)
@@ -331,15 +316,32 @@ def by_protocol(board: Board) -> dict[str, list[str]]:
 def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) -> Aggregate | None:
     """Statistics over tasks (by default all); None where no method was measured on every one with the same seed."""
     tasks = board.tasks if tasks is None else tasks
-    seeds, left_out = _common_seeds(board, tasks)
+    # By method the seeds that every task has; by method without any the tasks that lack it.
+    seeds: dict[Method, tuple[int, ...]] = {}
+    left_out: dict[Method, list[str]] = {}
+    for method in board.methods:
+        lines = {task: board.line(task, method) for task in tasks}
+        had = {task: set(line.seeds) if line else set() for task, line in lines.items()}
+        common = tuple(sorted(set.intersection(*had.values())))
+        if common:
+            seeds[method] = common
+        else:
+            left_out[method] = [task for task in tasks if not had[task]]
     methods = list(seeds)
     if not methods:
         return None
     returns = {m: _scores(board, tasks, m, seeds[m], _normal_return) for m in methods}
     costs = {m: _scores(board, tasks, m, seeds[m], _normal_cost) for m in methods}
     episode_costs = {m: _scores(board, tasks, m, seeds[m], _normal_episode_costs) for m in methods}
-    return_thresholds = np.linspace(*_range(returns), 101)
-    cost_thresholds = _cost_thresholds(episode_costs)
+    # From the worst to the best run, at least from 0 to 1.
+    low = min(0.0, *(float(s.min()) for s in returns.values()))
+    high = max(1.0, *(float(s.max()) for s in returns.values()))
+    return_thresholds = np.linspace(low, high, 101)
+    # From 0 to where nine of ten episodes of every method lie, at least to 3. Whole numbers are among them, since costs
+    # count steps.
+    most = max(float(np.quantile(costs, 0.9)) for costs in episode_costs.values())
+    top = int(np.ceil(max(3.0, most)))
+    cost_thresholds = np.linspace(0.0, top, 20 * top + 1)
     above = {m: (returns[m][..., None] > return_thresholds).astype(float) for m in methods}
     within = {m: (episode_costs[m][..., None] <= cost_thresholds).mean(2) for m in methods}
     return Aggregate(
@@ -363,21 +365,6 @@ def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) 
     )
 
 
-def _common_seeds(board: Board, tasks: list[str]) -> tuple[dict[Method, tuple[int, ...]], dict[Method, list[str]]]:
-    """(by method the seeds that every task has; by method without any the tasks that lack it)."""
-    seeds: dict[Method, tuple[int, ...]] = {}
-    left_out: dict[Method, list[str]] = {}
-    for method in board.methods:
-        lines = {task: board.line(task, method) for task in tasks}
-        had = {task: set(line.seeds) if line else set() for task, line in lines.items()}
-        common = tuple(sorted(set.intersection(*had.values())))
-        if common:
-            seeds[method] = common
-        else:
-            left_out[method] = [task for task in tasks if not had[task]]
-    return seeds, left_out
-
-
 Score = Callable[[Result], float | np.ndarray]
 
 
@@ -397,21 +384,6 @@ def _normal_cost(result: Result) -> float:
 
 def _normal_episode_costs(result: Result) -> np.ndarray:
     return normal_cost(np.array(result["per_episode"]["cost"]), result["constants"])
-
-
-def _range(scores: dict[Method, np.ndarray]) -> Interval:
-    """From the worst to the best run, at least from 0 to 1."""
-    low = min(s.min() for s in scores.values())
-    high = max(s.max() for s in scores.values())
-    return min(0.0, float(low)), max(1.0, float(high))
-
-
-def _cost_thresholds(episode_costs: dict[Method, np.ndarray]) -> np.ndarray:
-    """From 0 to where nine of ten episodes of every method lie, at least to 3. Whole numbers are among them, since
-    costs count steps."""
-    most = max(float(np.quantile(costs, 0.9)) for costs in episode_costs.values())
-    top = int(np.ceil(max(3.0, most)))
-    return np.linspace(0.0, top, 20 * top + 1)
 
 
 def _iqm(scores: np.ndarray) -> tuple[float, Interval | None]:

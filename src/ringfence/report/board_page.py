@@ -8,7 +8,6 @@ with our rows.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,13 +45,9 @@ def build_board(folder: str | Path, out: str | Path, title: str | None = None) -
     """
     board = read(folder)
     out = html.page_file(out)
-    return html.write(out, html.render(TEMPLATE, _context(board, out, title)))
-
-
-def _context(board: Board, out: Path, title: str | None) -> dict[str, Any]:
     lines = [line for some in board.lines.values() for line in some]
     any_line = {line.method: line for line in reversed(lines) if line.method}
-    return {
+    context = {
         "title": title or f"Leaderboard: {board.suite.replace('_', ' ')}",
         "js": "",
         "board": board,
@@ -68,6 +63,7 @@ def _context(board: Board, out: Path, title: str | None) -> dict[str, Any]:
         "missing": _missing(board),
         "environments": environments([run for each in board.sections.values() for run in each.runs]),
     }
+    return html.write(out, html.render(TEMPLATE, context))
 
 
 def short(task: str, suite: str) -> str:
@@ -325,7 +321,15 @@ def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> Ma
         for row in range(n):
             for column in range(n):
                 if row != column:
-                    _duel(ax, row, column, float(matrix[row, column]))
+                    p = float(matrix[row, column])
+                    # (fill, ink) of a probability: orange below one half, blue above, the further the stronger.
+                    far = min(1.0, abs(2 * p - 1))
+                    end = np.array([33, 102, 172] if p >= 0.5 else [191, 91, 23])
+                    rgb = np.round(247 + (end - 247) * far).astype(int)
+                    light = float(rgb @ [0.299, 0.587, 0.114]) > 140
+                    fill, ink = "#{:02x}{:02x}{:02x}".format(*rgb), "#101010" if light else "#fafafa"
+                    ax.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=fill, edgecolor="none"))
+                    ax.text(column, row, f"{p:.2f}", ha="center", va="center", color=ink, fontsize=9)
         ax.set(xlim=(-0.5, n - 0.5), ylim=(n - 0.5, -0.5))
         ax.set_yticks(range(n), [f"{k}. {label}" for k, label in numbered])
         ax.set_xticks(range(n), [str(k) for k, _ in numbered])
@@ -336,21 +340,6 @@ def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> Ma
         ax.set_xlabel("compared with the method of this number")
         rows = ", ".join(f"{k} {label}" for k, label in numbered)
         return to_svg(made, f"Probability that the row's method {what} than the column's; rows are {rows}", name)
-
-
-def _duel(ax: Axes, row: int, column: int, p: float) -> None:
-    fill, ink = _shade(p)
-    ax.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=fill, edgecolor="none"))
-    ax.text(column, row, f"{p:.2f}", ha="center", va="center", color=ink, fontsize=9)
-
-
-def _shade(p: float) -> tuple[str, str]:
-    """(fill, ink) of a probability: orange below one half, blue above, the further the stronger."""
-    far = min(1.0, abs(2 * p - 1))
-    end = np.array([33, 102, 172] if p >= 0.5 else [191, 91, 23])
-    rgb = np.round(247 + (end - 247) * far).astype(int)
-    light = float(rgb @ [0.299, 0.587, 0.114]) > 140
-    return "#{:02x}{:02x}{:02x}".format(*rgb), "#101010" if light else "#fafafa"
 
 
 def profiles(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> Markup:
@@ -428,32 +417,28 @@ def expenses(rows: list[Line], name: str) -> Markup:
         made = figure(WIDTH, 1.2 + 0.32 * len(rows))
         axes = made.subplots(1, len(panels), sharey=True)
         for ax, (title, values, form) in zip(axes, panels):
-            _expense(ax, rows, values, form)
+            # A bar and a number per row, the first on top.
+            measured = [v for v in values if v] or [1.0, 10.0]
+            low = min(measured)
+            high = max(measured)
+            left = low / 1.6
+            ax.set_xscale("log")
+            ax.set_xlim(left, high * max(4.0, (high / low) ** 0.55))
+            for y, (row, value) in enumerate(zip(rows, values)):
+                if value:
+                    ax.plot((left, value), (y, y), color=colour(row.style), linewidth=1.2, alpha=0.5)
+                    ax.plot(value, y, marker(row.style), color=colour(row.style), markersize=6)
+                text = form.format(value) if value else "not measured"
+                where = (value or left, y)
+                ax.annotate(text, where, (7, 0), textcoords="offset points", va="center", fontsize=8.5, color=INK)
+            ax.set_ylim(len(rows) - 0.5, -0.5)
+            ax.grid(axis="y", visible=False)
+            ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 3.0)))
+            ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _brief(x)))
+            ax.minorticks_off()
             ax.set_xlabel(title)
         axes[0].set_yticks(range(len(rows)), [r.label for r in rows])
         return to_svg(made, "Training time, parameters and time to act of each method", name)
-
-
-def _expense(ax: Axes, rows: list[Line], values: Sequence[float | None], form: str) -> None:
-    """A bar and a number per row, the first on top."""
-    measured = [v for v in values if v] or [1.0, 10.0]
-    low = min(measured)
-    high = max(measured)
-    left = low / 1.6
-    ax.set_xscale("log")
-    ax.set_xlim(left, high * max(4.0, (high / low) ** 0.55))
-    for y, (row, value) in enumerate(zip(rows, values)):
-        if value:
-            ax.plot((left, value), (y, y), color=colour(row.style), linewidth=1.2, alpha=0.5)
-            ax.plot(value, y, marker(row.style), color=colour(row.style), markersize=6)
-        text = form.format(value) if value else "not measured"
-        where = (value or left, y)
-        ax.annotate(text, where, (7, 0), textcoords="offset points", va="center", fontsize=8.5, color=INK)
-    ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.grid(axis="y", visible=False)
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 3.0)))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _brief(x)))
-    ax.minorticks_off()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
@@ -167,38 +166,37 @@ def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) ->
         made, columns = figure_with_legend(8.2, 4.4, [line.label for line in points])
         ax = made.add_subplot()
         for line in points:
-            _point(ax, line)
+            ink = INK if line.reference else colour(line.style)
+            x = line.cost_safe_start
+            y = line.returns
+            ax.plot(line.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
+            ax.plot((x, x), line.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
+            look = {
+                "color": ink,
+                "mfc": "none" if line.reference else ink,
+                "markersize": 7,
+                "zorder": 3,
+                "linestyle": "none",
+            }
+            ax.plot(x, y, marker=marker(line.style), label=line.label, **look)
         ax.margins(0.08, 0.1)
         several = any(line.limits for line in points)  # one line is no limit of theirs
-        _cost_axis(ax, section.constants["cost_limit"] if section.constants and not several else 0.0)
+        # The limit as a line, and costs by their square roots where they reach far beyond it.
+        limit = section.constants["cost_limit"] if section.constants and not several else 0.0
+        low, high = ax.get_xlim()
+        if limit > 0:  # beside the points, where it is in view
+            ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
+        if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
+            ax.set_xscale("function", functions=(_root, _square))
+            ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
+            ax.set_xlim(-0.002 * high, 1.1 * high)
+        else:
+            ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
         ax.set_xlabel(f"{x_label}, safe starts")
         ax.set_ylabel("return per episode")
         made.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
         each = [f"{r.label}: return {r.returns:.1f}, cost of safe starts {r.cost_safe_start:.3f}" for r in points]
         return to_svg(made, f"Return against the cost of safe starts on {section.task}. {'; '.join(each)}", name)
-
-
-def _point(ax: Axes, line: Line) -> None:
-    ink = INK if line.reference else colour(line.style)
-    x = line.cost_safe_start
-    y = line.returns
-    ax.plot(line.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
-    ax.plot((x, x), line.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
-    look = {"color": ink, "mfc": "none" if line.reference else ink, "markersize": 7, "zorder": 3, "linestyle": "none"}
-    ax.plot(x, y, marker=marker(line.style), label=line.label, **look)
-
-
-def _cost_axis(ax: Axes, limit: float) -> None:
-    """The limit as a line, and costs by their square roots where they reach far beyond it."""
-    low, high = ax.get_xlim()
-    if limit > 0:  # beside the points, where it is in view
-        ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
-    if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
-        ax.set_xscale("function", functions=(_root, _square))
-        ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
-        ax.set_xlim(-0.002 * high, 1.1 * high)
-    else:
-        ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
 
 
 def _root(x: np.ndarray) -> np.ndarray:
@@ -372,23 +370,19 @@ def _draw_fields(fields: dict[str, np.ndarray], radius: float, rest: np.ndarray,
         made = figure(4.1 * len(fields) + 0.7, 4.0)
         axes = made.subplots(1, len(fields), squeeze=False, sharey=True)[0]
         for ax, (case, h) in zip(axes, fields.items()):
-            _draw_field(ax, h, scale, radius, near)
+            extent = (-1.0125, 1.0125, -1.0125, 1.0125)
+            ax.imshow(h, origin="lower", extent=extent, cmap="RdBu", norm=scale, interpolation="bilinear")
+            if h.min() < 0 < h.max():
+                ax.contour(GRID_SIDE, GRID_SIDE, h, [0.0], colors="black", linewidths=1.8)
+            ax.add_patch(Circle((0, 0), radius, fill=False, linestyle="--", edgecolor="black", linewidth=1.2))
+            ax.plot(0, 0, "+", color="black")
+            if len(near):
+                ax.plot(near[:, 0], near[:, 1], "o", mfc="none", color="black", markersize=9)
             ax.set(title=f"other agent {case}", xlabel="other agent's x − own x (m)", xlim=(-1, 1), ylim=(-1, 1))
         axes[0].set_ylabel("other agent's y − own y (m)")
         bar = made.colorbar(axes[-1].images[0], ax=list(axes), shrink=0.85)
         bar.set_label("h  (negative: judged unsafe)")
         return to_svg(made, label, name)
-
-
-def _draw_field(ax: Axes, h: np.ndarray, scale: TwoSlopeNorm, radius: float, near: np.ndarray) -> None:
-    extent = (-1.0125, 1.0125, -1.0125, 1.0125)
-    ax.imshow(h, origin="lower", extent=extent, cmap="RdBu", norm=scale, interpolation="bilinear")
-    if h.min() < 0 < h.max():
-        ax.contour(GRID_SIDE, GRID_SIDE, h, [0.0], colors="black", linewidths=1.8)
-    ax.add_patch(Circle((0, 0), radius, fill=False, linestyle="--", edgecolor="black", linewidth=1.2))
-    ax.plot(0, 0, "+", color="black")
-    if len(near):
-        ax.plot(near[:, 0], near[:, 1], "o", mfc="none", color="black", markersize=9)
 
 
 def _agreement(case: str, h: np.ndarray, radius: float) -> str:

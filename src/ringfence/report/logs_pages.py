@@ -57,7 +57,8 @@ def _figures(card: Card, result: OPEResult | None) -> list[Drawn]:
     drawn = []
     barrier = card.barrier
     if barrier is not None and barrier.calibration:
-        drawn.append(Drawn("What a margin means", _calibration(barrier), _said_of(barrier)))
+        said = f"Dashed: the default margin, {barrier.margin:.2g}. Held-out steps, as often unsafe as in the logs."
+        drawn.append(Drawn("What a margin means", _calibration(barrier), said))
     if result is not None and result.safety is not None:
         said = (
             "The share of safe logged states whose smallest predicted margin is below a value. Below 0: danger is "
@@ -90,10 +91,6 @@ def _calibration(barrier: BarrierScores) -> Markup:
             ax.axvline(barrier.margin, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
             ax.set_xlabel("margin of a held-out step, or more")
         return to_svg(made, "Unsafe steps and safe steps by margin", "calibration")
-
-
-def _said_of(barrier: BarrierScores) -> str:
-    return f"Dashed: the default margin, {barrier.margin:.2g}. Held-out steps, as often unsafe as in the logs."
 
 
 def _margins(safety: Safety) -> Markup:

@@ -17,7 +17,6 @@ import numpy as np
 from markupsafe import Markup
 
 from ringfence.datasets import registry
-from ringfence.datasets.task import Task
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings, reference, statistics
 from ringfence.evaluation.recordings import LONGEST
@@ -130,7 +129,7 @@ def of_section(section: Section, k: int) -> dict[str, Any]:
 def _of_runs(section: Section, k: int, out: Path) -> dict[str, Any]:
     """What the page of runs shows beside that."""
     recorded = players(section)
-    simulated = _simulated(section)
+    simulated = registry.simulated(section.task, constraints.from_dict(section.hazard)) if section.hazard else None
     families = {_family_name(m): line.style[0] for line in section.lines if (m := line.method)}
     return {
         "curves": figures.training_curves(section.lines, f"t{k}"),
@@ -144,11 +143,6 @@ def _of_runs(section: Section, k: int, out: Path) -> dict[str, Any]:
         "commands": provenance.commands(section, out),
         "differences": provenance.differences(section.runs),
     }
-
-
-def _simulated(section: Section) -> Task | None:
-    """The task, where a simulator of this package plays it."""
-    return registry.simulated(section.task, constraints.from_dict(section.hazard)) if section.hazard else None
 
 
 def guard_table(lines: list[Line]) -> list[GuardLine]:
@@ -384,24 +378,20 @@ def films(section: Section) -> list[dict[str, Any]]:
         for row in line.rows:
             file = recordings.kept(row.file.parent, row.name, "gif")
             if file is not None:
-                gif = base64.b64encode(_film(row.file.parent, file)).decode()
+                # A GIF that lies in the run's folder: a page that is passed on must hold no other file of its maker's.
+                try:
+                    size = regular(within(row.file.parent, file)).stat().st_size
+                    if size > LARGEST:
+                        raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
+                    content = file.read_bytes()
+                    if not content.startswith((b"GIF87a", b"GIF89a")):
+                        raise ValueError("it is no GIF")
+                except (OSError, ValueError) as error:
+                    raise UserError(f"'{file}' is no film of this run ({error}); delete that file.") from None
+                gif = base64.b64encode(content).decode()
                 found.append({"label": line.label, "seed": row.seed, "gif": gif})
                 break
     return found[-VARIANTS:]
-
-
-def _film(folder: Path, file: Path) -> bytes:
-    """A GIF that lies in the run's folder: a page that is passed on must hold no other file of its maker's."""
-    try:
-        size = regular(within(folder, file)).stat().st_size
-        if size > LARGEST:
-            raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
-        content = file.read_bytes()
-        if not content.startswith((b"GIF87a", b"GIF89a")):
-            raise ValueError("it is no GIF")
-    except (OSError, ValueError) as error:
-        raise UserError(f"'{file}' is no film of this run ({error}); delete that file.") from None
-    return content
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,7 +482,11 @@ def _of_places(section: Section, recorded: Recorded) -> Moved:
 def _episode(arrays: recordings.Recording, moved: Moved, e: int) -> dict[str, Any]:
     """The e-th episode."""
     steps = moved.steps[e]
-    positions = _kept_on(moved.places[e]) - moved.middle[e]
+    # Places (L+1, N, 2) where who is not shown any more stays where he was; the first row is known.
+    places = moved.places[e]
+    known = np.isfinite(places).all(-1)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(places))[:, None], 0), 0)
+    positions = np.take_along_axis(places, last[..., None], 0) - moved.middle[e]
     landmarks = moved.landmarks[e] - moved.middle[e]
     reach = float(np.abs(np.concatenate([positions.reshape(-1, 2), landmarks])).max())
     shown = reach * 1.1 + 1e-3 if moved.arena is None else max(moved.arena, reach) + 0.2
@@ -512,13 +506,6 @@ def _episode(arrays: recordings.Recording, moved: Moved, e: int) -> dict[str, An
     if moved.plans is not None:
         episode["plans"] = few(moved.plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
     return episode
-
-
-def _kept_on(places: np.ndarray) -> np.ndarray:
-    """Places (L+1, N, 2) where who is not shown any more stays where he was; the first row is known."""
-    known = np.isfinite(places).all(-1)
-    last = np.maximum.accumulate(np.where(known, np.arange(len(places))[:, None], 0), 0)
-    return np.take_along_axis(places, last[..., None], 0)
 
 
 def tracks(arrays: recordings.Recording, names: list[str], n: int, history: int) -> np.ndarray | None:

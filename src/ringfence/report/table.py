@@ -263,7 +263,9 @@ def methods_of(rows: Iterable[Row]) -> dict[Row, Method]:
         groups.setdefault((row.algorithm, row.preset, row.task), []).append(mine)
     apart: dict[tuple[str, str], dict[str, None]] = {}
     for (algorithm, preset, _), several in groups.items():
-        apart.setdefault((algorithm, preset), {}).update(dict.fromkeys(_differing(several)))
+        fields = dict.fromkeys(k for one in several for k in one)
+        differing = [k for k in fields if len({json.dumps(one.get(k)) for one in several}) > 1]
+        apart.setdefault((algorithm, preset), {}).update(dict.fromkeys(differing))
     found = {}
     for row, mine in settings.items():
         words = ", ".join(f"{k}={mine.get(k)}" for k in apart[row.algorithm, row.preset])
@@ -277,11 +279,6 @@ def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
     known = ALGORITHMS.get(config["algorithm"])  # none of somebody else's
     defaults = {} if known is None else {name: f.default for name, f in fields_of(known.Config).items()}
     return defaults | config["config"] | {"revision": config.get("revision", 1)}
-
-
-def _differing(settings: list[dict[str, Any]]) -> list[str]:
-    fields = dict.fromkeys(k for one in settings for k in one)
-    return [k for k in fields if len({json.dumps(one.get(k)) for one in settings}) > 1]
 
 
 def paint(lines: Iterable[Line]) -> None:

@@ -314,7 +314,12 @@ class _Training:
                 "by one."
             )
         for run in runs:
-            _trim_metrics(run, steps[0])
+            # Drop log lines past the checkpoint that training resumes from.
+            rows = [r for r in run.metrics if r["step"] <= steps[0]]
+            file = run.path / "metrics.jsonl"
+            if file.exists():
+                with whole(file) as temporary:
+                    temporary.write_text("".join(json.dumps(r) + "\n" for r in rows))
         whose = f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} seeds"
         tensorboard = [_summary_writer()(str(run.path / "tensorboard")) for run in runs if options.tensorboard]
         return cls(
@@ -347,7 +352,8 @@ class _Training:
                     if self.step // every > (self.step - count) // every or self.step == steps:
                         self._save()
             except KeyboardInterrupt:
-                if self.saved < self.step and not _deleted(self.state):
+                # Inside a compiled call it leaves donated buffers behind; there is nothing to save then.
+                if self.saved < self.step and not any(x.is_deleted() for x in jax.tree.leaves(self.state)):
                     self._save()
                 raise
         if self.saved < self.step:
@@ -416,11 +422,6 @@ def learned(state: PyTree) -> PyTree:
     return {k: v for k, v in state.items() if k != "world"}
 
 
-def _deleted(state: PyTree) -> bool:
-    """An interruption inside a compiled call leaves donated buffers behind; there is nothing to save then."""
-    return any(x.is_deleted() for x in jax.tree.leaves(state))
-
-
 def folder_of(out: str | Path, job: Job, seed: int) -> Path:
     """runs/simple_spread-medium/icbf/seed-0"""
     name = job.algorithm.name if job.preset == "default" else f"{job.algorithm.name}-{job.preset}"
@@ -448,15 +449,6 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore, card: dict[str, 
         if job.task.env is None:  # rows of a benchmark's data are made with its references
             write_json(run.path / LOGS, data.outcomes)
         write_json(run.path / "config.json", mine)
-
-
-def _trim_metrics(run: Run, step: int) -> None:
-    """Drop log lines past the checkpoint that training resumes from."""
-    rows = [r for r in run.metrics if r["step"] <= step]
-    file = run.path / "metrics.jsonl"
-    if file.exists():
-        with whole(file) as temporary:
-            temporary.write_text("".join(json.dumps(r) + "\n" for r in rows))
 
 
 def _summary_writer():

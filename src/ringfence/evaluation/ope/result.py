@@ -146,8 +146,8 @@ class OPEResult:
         if self.safety is not None:
             safety = self.safety
             lines.append(
-                f"danger is predicted within {self.ahead} steps from {_percent(safety.predicted_violation_rate)} of the "
-                f"safe states (the logs: {_percent(safety.predicted_violation_rate_of_logs)}); "
+                f"danger is predicted within {self.ahead} steps from {_percent(safety.predicted_violation_rate)} of "
+                f"the safe states (the logs: {_percent(safety.predicted_violation_rate_of_logs)}); "
                 f"{_percent(safety.margin_violation_rate)} do not keep the calibrated margin (the logs: "
                 f"{_percent(safety.margin_violation_rate_of_logs)})"
             )

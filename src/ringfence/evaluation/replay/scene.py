@@ -283,19 +283,7 @@ def windows_of(
     episode, start, driven = pairs.T
     rows = row0[keep, None] + np.arange(steps + 1)
     at = (first[episode] + start)[:, None] + np.arange(steps)
-    # Places and velocities (W, L+1, X) of the driven agents.
-    who = driven[:, None]
-    place = None if motion.place is None else motion.place[rows, who]
-    if motion.velocity is not None:
-        velocity = motion.velocity[rows, who]
-    elif place is not None:
-        moved = np.diff(place, axis=1) / dt
-        velocity = np.concatenate([moved[:, :1], moved], 1)
-    else:
-        raise UserError("The logs hold neither places nor velocities of the driven agent; name own.vx and own.vy.")
-    if place is None:
-        moved = (motion.late * velocity[:, 1:] + (1 - motion.late) * velocity[:, :-1]) * dt
-        place = np.concatenate([np.zeros_like(moved[:, :1]), moved.cumsum(1)], 1)
+    place, velocity = _tracks(motion, rows, driven, dt)
     goal = place[:, -1]
     if pair := names.pair("goal.d{}"):
         goal = place[:, 0] + store.observations[rows[:, 0], driven][:, pair]
@@ -315,3 +303,20 @@ def windows_of(
         dt=dt,
     )
     return made, left_out
+
+
+def _tracks(motion: Motion, rows: np.ndarray, driven: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places and velocities (W, L+1, X) of the driven agents."""
+    who = driven[:, None]
+    place = None if motion.place is None else motion.place[rows, who]
+    if motion.velocity is not None:
+        velocity = motion.velocity[rows, who]
+    elif place is not None:
+        moved = np.diff(place, axis=1) / dt
+        velocity = np.concatenate([moved[:, :1], moved], 1)
+    else:
+        raise UserError("The logs hold neither places nor velocities of the driven agent; name own.vx and own.vy.")
+    if place is None:
+        moved = (motion.late * velocity[:, 1:] + (1 - motion.late) * velocity[:, :-1]) * dt
+        place = np.concatenate([np.zeros_like(moved[:, :1]), moved.cumsum(1)], 1)
+    return place, velocity
