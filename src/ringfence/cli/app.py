@@ -17,7 +17,7 @@ from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
 from ringfence.cli.console import Refusals, complain, console, plain_warnings
-from ringfence.cli.doctor import doctor
+from ringfence.cli.first import demonstrate, doctor
 from ringfence.cli.flags import AS_IT_IS, AS_LOGGED, NO_FAULTS, Assignments, How, Playing, Replayed, Wrong, assignments
 from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
@@ -596,9 +596,7 @@ def demo(
         tier: expert, medium, medium-replay or random.
         quick: a smoke test of a minute or two, with numbers that mean nothing.
     """
-    from ringfence.cli.demo import run
-
-    run(out_dir, tier, quick)
+    demonstrate(out_dir, tier, quick)
 
 
 COMMANDS = {
