@@ -420,7 +420,12 @@ class _Group:
                     quiet=True,
                 )
             except Exception as error:
-                self._fail(error)
+                failed = self.left[0]
+                if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
+                    failed = next(c for c in self.left if c.folder(self.out) == error.folder)
+                record_failure(failed, self.out, f"{type(error).__name__}: {error}", traceback.format_exc())
+                self.left.remove(failed)
+                self.tell("failed", failed)
 
     def _start(self) -> None:
         self.begun = time.perf_counter()
@@ -449,14 +454,6 @@ class _Group:
         self.tell("done", self.left.pop(0))
         if self.left:
             self._start()
-
-    def _fail(self, error: Exception) -> None:
-        cell = self.left[0]
-        if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
-            cell = next(c for c in self.left if c.folder(self.out) == error.folder)
-        record_failure(cell, self.out, f"{type(error).__name__}: {error}", traceback.format_exc())
-        self.left.remove(cell)
-        self.tell("failed", cell)
 
 
 @functools.lru_cache(maxsize=1)

@@ -19,7 +19,7 @@ from ringfence.cli import log as log_commands
 from ringfence.cli.console import Refusals, complain, console, plain_warnings
 from ringfence.cli.first import demonstrate, doctor
 from ringfence.cli.flags import AS_IT_IS, AS_LOGGED, NO_FAULTS, Assignments, How, Playing, Replayed, Wrong, assignments
-from ringfence.errors import Interrupted, UserError, whole_number
+from ringfence.errors import Interrupted, UserError, one_of, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import lines, terminal
 from ringfence.utils.files import writable
@@ -79,11 +79,16 @@ def train(
         vmap_seeds: train all seeds in one program.
         tensorboard: write TensorBoard logs, too.
     """
+    from ringfence import algos
     from ringfence.training import loop
 
     changes = assignments(set)
     whole_number("seeds", seeds, 1, 10_000)
-    _early(algorithm, preset, changes)
+    # Refuse bad names before a data set is made for them.
+    chosen = algos.get(algorithm)
+    named = preset or chosen.preset_for(())
+    one_of(f"preset of {chosen.name}", named, chosen.presets)
+    algos.configured(chosen, named, changes)
     runs = loop.train(
         algorithm,
         _store(data),
@@ -678,17 +683,6 @@ def _group_of(arguments: list[str]) -> tuple[list[str], dict[str, Any], str]:
             return [name], commands, description
     helps = {"data": lambda: main(["data", "--help"]), "log": lambda: main(["log", "--help"])}
     return [], COMMANDS | helps, "Safe offline multi-agent reinforcement learning."
-
-
-def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:
-    """Refuse bad names before a data set is made for them."""
-    from ringfence import algos
-    from ringfence.errors import one_of
-
-    a = algos.get(algorithm)
-    preset = preset or a.preset_for(())
-    one_of(f"preset of {a.name}", preset, a.presets)
-    algos.configured(a, preset, changes)
 
 
 def _store(data: str) -> EpisodeStore:

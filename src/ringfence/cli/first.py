@@ -1,4 +1,8 @@
-"""The first commands of a new installation: `ringfence doctor`, and the whole job in one, `ringfence demo`."""
+"""The first commands of a new installation: `ringfence doctor`, and the whole job in one, `ringfence demo`.
+
+That is data, a World, a cloned policy and a planner, as they are and under guard, by the formula of danger and without
+it, on the same resets; report. MADIFF is the planner whose plans nothing guides.
+"""
 
 from __future__ import annotations
 
@@ -62,11 +66,7 @@ def _devices(found: list[str]) -> str:
 
 
 def demonstrate(folder: Path, tier: str = "expert", quick: bool = False) -> Path:
-    """Make `folder`/report.html and print the table that it holds; a few minutes on two cores.
-
-    Data, a World, a cloned policy and a planner, as they are and under guard, by the formula of danger and without it,
-    on the same resets. MADIFF is the planner whose plans nothing guides.
-    """
+    """Make `folder`/report.html and print the table that it holds; a few minutes on two cores."""
     from ringfence.datasets import registry
     from ringfence.datasets.make import make
     from ringfence.evaluation import reference

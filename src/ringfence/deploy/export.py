@@ -389,7 +389,10 @@ def step_of(job: Job, policy: Policy) -> Step:
             "This policy draws more than normal noise, and a file holds nothing that draws; play it with "
             "ringfence.Controller."
         )
-    used -= _constant_carry(traced)
+    # Carry that no step changes is a constant.
+    before = program.invars[len(program.invars) - len(traced.carry) :]
+    after = program.outvars[len(traced.results) :]
+    used -= {name for name, old, new in zip(traced.carry, before, after) if new is old}
     inputs = [k for k, name in enumerate(names) if name in used]
     outputs = [k for k, name in enumerate(traced.outputs) if k < len(traced.results) or _before(name) in used]
     unread = {variable: traced.carry[name] for name, variable in zip(names, program.invars[1:]) if name in traced.carry}
@@ -511,14 +514,6 @@ def _drawn(traced: _Traced, key: Key) -> list[Array]:
     zeros = [jnp.zeros(shape.shape, shape.dtype) for shape in traced.seen.values()]
     Interpreter(keep).run(traced.drawing, (key, *zeros, *traced.carry.values()))
     return noise
-
-
-def _constant_carry(traced: _Traced) -> set[str]:
-    """Names of carry that no step changes: it is a constant."""
-    program = traced.given.jaxpr
-    before = program.invars[len(program.invars) - len(traced.carry) :]
-    after = program.outvars[len(traced.results) :]
-    return {name for name, old, new in zip(traced.carry, before, after) if new is old}
 
 
 def _before(name: str) -> str:

@@ -90,6 +90,13 @@ class Certificate:
         again = "the same windows" if self.replayed else "a fresh batch"
         agreed = f"{again} agreed with it" if self.agreed else f"{again} did not agree with it"
         what = "windows" if self.replayed else "episodes"
+        replay = []
+        if self.replayed:
+            replay.append(
+                f"Logs were replayed in windows of {self.replayed['seconds']:.3g} s: one agent is driven "
+                f"({self.replayed['kinematics']}), the others do what they did and do not react, and a violation is to "
+                f"come nearer than {self.replayed['radius']:.3g} m. Windows of one log are no independent draws."
+            )
         return (
             f"With confidence {self.confidence:g} at most {100 * self.bound:.2f} % of {what} violate: "
             f"{self.violations} of {self.episodes} fresh ones did.",
@@ -98,17 +105,8 @@ class Certificate:
             f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batch{'es' * (len(self.rounds) > 1)}; "
             f"{agreed}.",
             f"In {100 * self.held:.1f} % of the fresh {what} no state scored below its prediction by more than that.",
-            *self._replay(),
+            *replay,
             f"It holds for {what} drawn as these were, not for each state, another simulator or an adversary.",
-        )
-
-    def _replay(self) -> tuple[str, ...]:
-        if not self.replayed:
-            return ()
-        return (
-            f"Logs were replayed in windows of {self.replayed['seconds']:.3g} s: one agent is driven "
-            f"({self.replayed['kinematics']}), the others do what they did and do not react, and a violation is to "
-            f"come nearer than {self.replayed['radius']:.3g} m. Windows of one log are no independent draws.",
         )
 
     def save(self, path: str | Path) -> Path:

@@ -310,14 +310,14 @@ def _summary(player: Player, begun: list[Episode]) -> dict[str, Any]:
     if len(played) < len(every):
         summary["skipped_episodes"] = len(every) - len(played)
     if played[0].constraints:
-        summary["constraints"] = {k: _of_constraint(played, k, player.limits) for k in played[0].constraints[0]}
+        # The team's cost per episode of each.
+        summary["constraints"] = {
+            name: protocol.of_constraint(
+                np.array([sum(float(np.max(c[name])) for c in e.constraints) for e in played]), player.limits.get(name)
+            )
+            for name in played[0].constraints[0]
+        }
     return summary
-
-
-def _of_constraint(played: list[Episode], name: str, limits: Mapping[str, float]) -> dict[str, Any]:
-    """Of one constraint: the team's cost per episode, its limit, and the share of episodes within it."""
-    costs = np.array([sum(float(np.max(c[name])) for c in e.constraints) for e in played])
-    return protocol.of_constraint(costs, limits.get(name))
 
 
 @dataclass(frozen=True)

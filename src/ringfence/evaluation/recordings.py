@@ -93,16 +93,14 @@ class Places:
     def __call__(self, now: Moment) -> None:
         """Where a step led, if that was shown."""
         if not self.rows:
-            self._begin(now.before)
+            before = self._of(now.before)
+            self.rows.append(before)
+            seen = now.before.observations[: len(before)]
+            found = [before + seen[..., pair[:2]] for pair in self.names.resting]
+            self.resting = np.concatenate([np.zeros((len(before), 0, 2)), *found], 1)
         if len(self.rows) <= LONGEST:
             place = self._of(now.after)
             self.rows.append(np.where(now.outcome.shown[: len(place), None, None], place, np.nan))
-
-    def _begin(self, seen: Seen) -> None:
-        place = self._of(seen)
-        self.rows.append(place)
-        found = [place + seen.observations[: len(place)][..., pair[:2]] for pair in self.names.resting]
-        self.resting = np.concatenate([np.zeros((len(place), 0, 2)), *found], 1)
 
     def _of(self, seen: Seen) -> np.ndarray:
         """(R, N, 2)"""

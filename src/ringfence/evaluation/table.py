@@ -104,8 +104,13 @@ def check(rows: Iterable[Row], declared: Mapping[str, Any] | None = None, by: st
             for name in ("protocol",) if row.split == "data" else ("protocol", "split", "episodes"):
                 _check_same(row, name, declared[name], by)
         _check_same(row, "constants", leader.result["constants"], leader.where)
-        if row.run is not None:
-            _check_data(row, trained.setdefault(row.task, row))
+        first = row if row.run is None else trained.setdefault(row.task, row)
+        if unlike := other_data(row.data, first.data):
+            what, here, there = unlike[0]
+            raise UserError(
+                f"'{row.file.parent}' was trained on other data (its {what} is {here}) than '{first.file.parent}' "
+                f"({there}); such numbers cannot stand in one table: give each data set one of its own."
+            )
 
 
 def _check_whole(row: Row) -> None:
@@ -126,13 +131,4 @@ def _check_same(row: Row, name: str, wanted: Any, whose: str) -> None:
         raise UserError(
             f"{row.where} has {name} {row.result[name]}, {whose} has {wanted}; such numbers cannot stand in one table: "
             "evaluate one of them again, or keep it in a folder of its own."
-        )
-
-
-def _check_data(row: Row, first: Row) -> None:
-    if unlike := other_data(row.data, first.data):
-        name, here, there = unlike[0]
-        raise UserError(
-            f"'{row.file.parent}' was trained on other data (its {name} is {here}) than '{first.file.parent}' "
-            f"({there}); such numbers cannot stand in one table: give each data set one of its own."
         )

@@ -94,7 +94,9 @@ class PolicySpec:
             anyway=anyway,
         )
         if not spec.guarded:
-            _refuse_unread(barrier=barrier, world=None if options.get("barrier_guidance") else world)
+            for name, given in (("barrier", barrier), ("world", None if options.get("barrier_guidance") else world)):
+                if given is not None:
+                    raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
         return spec
 
     @classmethod
@@ -158,13 +160,6 @@ class PolicySpec:
     def without_plans(self) -> PolicySpec:
         """The same of a policy that draws no plans, which reads no choice of planners."""
         return replace(self, planner=DEFAULT, plan_options=())
-
-
-def _refuse_unread(**choices: Any) -> None:
-    """Of a guard, where there is none."""
-    for name, given in choices.items():
-        if given is not None:
-            raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
 
 
 def _known(kind: str, name: Any, known: Any) -> None:

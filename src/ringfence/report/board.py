@@ -330,9 +330,19 @@ def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) 
     methods = list(seeds)
     if not methods:
         return None
-    returns = {m: _scores(board, tasks, m, seeds[m], _normal_return) for m in methods}
-    costs = {m: _scores(board, tasks, m, seeds[m], _normal_cost) for m in methods}
-    episode_costs = {m: _scores(board, tasks, m, seeds[m], _normal_episode_costs) for m in methods}
+
+    def scores(score: Callable[[Result, dict[str, float]], float | np.ndarray]) -> dict[Method, np.ndarray]:
+        """(seeds, tasks, ...) of every method."""
+        found = {}
+        for m in methods:
+            by_task = [{row.seed: row.result for row in line.rows} for t in tasks if (line := board.line(t, m))]
+            each = [[score(results[seed], results[seed]["constants"]) for results in by_task] for seed in seeds[m]]
+            found[m] = np.array(each)
+        return found
+
+    returns = scores(lambda result, constants: normal_return(result["return_mean"], constants))
+    costs = scores(lambda result, constants: normal_cost(result["cost_mean"], constants))
+    episode_costs = scores(lambda result, constants: normal_cost(np.array(result["per_episode"]["cost"]), constants))
     # From the worst to the best run, at least from 0 to 1.
     low = min(0.0, *(float(s.min()) for s in returns.values()))
     high = max(1.0, *(float(s.max()) for s in returns.values()))
@@ -363,27 +373,6 @@ def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) 
         cost_profiles=np.array([statistics.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
         cost_bands=[_band(within[m]) for m in methods],
     )
-
-
-Score = Callable[[Result], float | np.ndarray]
-
-
-def _scores(board: Board, tasks: list[str], method: Method, seeds: tuple[int, ...], score: Score) -> np.ndarray:
-    """(seeds, tasks, ...) scores of a method."""
-    by_task = [{row.seed: row.result for row in line.rows} for t in tasks if (line := board.line(t, method))]
-    return np.array([[score(results[seed]) for results in by_task] for seed in seeds])
-
-
-def _normal_return(result: Result) -> float:
-    return normal_return(result["return_mean"], result["constants"])
-
-
-def _normal_cost(result: Result) -> float:
-    return normal_cost(result["cost_mean"], result["constants"])
-
-
-def _normal_episode_costs(result: Result) -> np.ndarray:
-    return normal_cost(np.array(result["per_episode"]["cost"]), result["constants"])
 
 
 def _iqm(scores: np.ndarray) -> tuple[float, Interval | None]:

@@ -101,24 +101,20 @@ def _ranks(board: Board, tasks: list[str]) -> list[RankingRow]:
     """Mean ranks are counted among the methods that were measured on every task; the others come last, since they have
     none."""
     cells = {m: [board.line(t, m) for t in tasks] for m in board.methods}
-    means = _mean_ranks(board, tasks, cells)
+    # Of the methods that were measured on every task, among themselves.
+    complete = {m: [cell for cell in row if cell] for m, row in cells.items() if all(row)}
+    places: list[np.ndarray] = []
+    for k, task in enumerate(tasks):
+        measured = [row[k] for row in complete.values()]
+        limit = board.sections[task].constants.get("cost_limit", 0.0)  # a task may have no result yet
+        places.append(statistics.places([r.returns for r in measured], [r.cost_interval[1] for r in measured], limit))
+    means = {m: float(np.mean([place[k] for place in places])) for k, m in enumerate(complete)}
     rows = [
         RankingRow(first, row, means.get(method))
         for method, row in cells.items()
         if (first := next((cell for cell in row if cell), None))
     ]
     return sorted(rows, key=lambda r: (r.mean is None, r.mean or 0.0))
-
-
-def _mean_ranks(board: Board, tasks: list[str], cells: dict[Method, list[Line | None]]) -> dict[Method, float]:
-    """Of the methods that were measured on every task, among themselves."""
-    complete = {m: [cell for cell in row if cell] for m, row in cells.items() if all(row)}
-    places: list[np.ndarray] = []
-    for k, task in enumerate(tasks):
-        rows = [row[k] for row in complete.values()]
-        limit = board.sections[task].constants.get("cost_limit", 0.0)  # a task may have no result yet
-        places.append(statistics.places([r.returns for r in rows], [r.cost_interval[1] for r in rows], limit))
-    return {m: float(np.mean([place[k] for place in places])) for k, m in enumerate(complete)}
 
 
 # --- sections ---
@@ -184,13 +180,10 @@ def published(board: Board) -> PublishedTable | None:
         again = any(entry.algorithms == later.algorithms for later in printed[k + 1 :])  # ours follow the last of them
         ours = [] if again else [m for m in board.methods if matches(entry, m.algorithm)]
         numbers = [entry.values.get(t) for t in tasks]
-        rows.append(PublishedRow(entry.name, entry.source, numbers, [_ours(board, m, tasks) for m in ours]))
+        lines = {m: [board.line(t, m) for t in tasks] for m in ours}
+        percent = [Ours(m.label, [100 * x.returns_norm if x else None for x in row]) for m, row in lines.items()]
+        rows.append(PublishedRow(entry.name, entry.source, numbers, percent))
     return PublishedTable([short(t, board.suite) for t in tasks], rows)
-
-
-def _ours(board: Board, method: Method, tasks: list[str]) -> Ours:
-    cells = [board.line(t, method) for t in tasks]
-    return Ours(method.label, [None if cell is None else 100 * cell.returns_norm for cell in cells])
 
 
 def _section(board: Board, task: str, k: int, out: Path) -> dict[str, Any]:

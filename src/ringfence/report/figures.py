@@ -187,7 +187,9 @@ def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) ->
         if limit > 0:  # beside the points, where it is in view
             ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
         if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
-            ax.set_xscale("function", functions=(_root, _square))
+            ax.set_xscale(
+                "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * x**2)
+            )
             ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
             ax.set_xlim(-0.002 * high, 1.1 * high)
         else:
@@ -197,14 +199,6 @@ def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) ->
         made.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
         each = [f"{r.label}: return {r.returns:.1f}, cost of safe starts {r.cost_safe_start:.3f}" for r in points]
         return to_svg(made, f"Return against the cost of safe starts on {section.task}. {'; '.join(each)}", name)
-
-
-def _root(x: np.ndarray) -> np.ndarray:
-    return np.sign(x) * np.sqrt(np.abs(x))
-
-
-def _square(x: np.ndarray) -> np.ndarray:
-    return np.sign(x) * x**2
 
 
 # --- training ---

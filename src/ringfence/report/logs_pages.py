@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from ringfence.datasets.audit import Audit
-from ringfence.evaluation.ope.result import Behaviour, OPEResult, Safety
+from ringfence.evaluation.ope.result import OPEResult, Safety
 from ringfence.evaluation.replay.judge import Film, ReplayResult
 from ringfence.report import html
 from ringfence.report.figures import INK, Drawn, figure, style, to_svg
@@ -37,6 +36,7 @@ def build_ope(out: str | Path, card: Card, audit: Audit, result: OPEResult | Non
     title = f"{card.data.task}: what its logs say"
     if result is not None:
         title += f" of {result.algorithm}"
+    rates = [] if result is None else [(said, getattr(result.behaviour, name)) for name, said in BEHAVIOUR.items()]
     text = html.render(
         "ope.html.j2",
         {
@@ -47,7 +47,7 @@ def build_ope(out: str | Path, card: Card, audit: Audit, result: OPEResult | Non
             "figures": _figures(card, result),
             "probes": panels(card),
             "ope": result,
-            "behaviour": [] if result is None else _rates(result.behaviour),
+            "behaviour": [(said, rate) for said, rate in rates if rate is not None],
         },
     )
     return html.write(Path(out), text)
@@ -67,11 +67,6 @@ def _figures(card: Card, result: OPEResult | None) -> list[Drawn]:
         title = f"Margins predicted along {result.ahead} steps"
         drawn.append(Drawn(title, _margins(result.safety), said))
     return drawn
-
-
-def _rates(behaviour: Behaviour) -> list[tuple[str, float]]:
-    rates = [(said, getattr(behaviour, name)) for name, said in BEHAVIOUR.items()]
-    return [(said, rate) for said, rate in rates if rate is not None]
 
 
 def _calibration(barrier: BarrierScores) -> Markup:
@@ -112,17 +107,16 @@ def _margins(safety: Safety) -> Markup:
 
 def panels(card: Card) -> list[Drawn]:
     """A picture of every probe on a card, by constraint where the logs name several."""
+    drawn = []
     each = card.constraints or ({"": card.barrier} if card.barrier else {})
-    return [drawn for k, (name, scores) in enumerate(each.items()) for drawn in _of(scores, name, f"probe{k}")]
-
-
-def _of(scores: BarrierScores, constraint: str, prefix: str) -> Iterator[Drawn]:
-    of = f" (‘{constraint}’)" if constraint else ""
-    for k, probe in enumerate(sorted(scores.probes, key=lambda probe: not probe.unsafe)):
-        draw = _neighbour if probe.unsafe else _curve
-        yield draw(probe, f"{_subject(probe.name)}{of}", f"{prefix}-{k}")
-    for k, plane in enumerate(scores.maps):
-        yield _map(plane, f"{_subject(plane.name)}{of}", f"{prefix}-map{k}")
+    for k, (constraint, scores) in enumerate(each.items()):
+        of = f" (‘{constraint}’)" if constraint else ""
+        for j, probe in enumerate(sorted(scores.probes, key=lambda probe: not probe.unsafe)):
+            draw = _neighbour if probe.unsafe else _curve
+            drawn.append(draw(probe, f"{_subject(probe.name)}{of}", f"probe{k}-{j}"))
+        for j, plane in enumerate(scores.maps):
+            drawn.append(_map(plane, f"{_subject(plane.name)}{of}", f"probe{k}-map{j}"))
+    return drawn
 
 
 def _subject(name: str) -> str:

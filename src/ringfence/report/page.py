@@ -241,17 +241,12 @@ def headline(section: Section, split: str = "test") -> list[str]:
                 f"The data itself has a return of {row.returns:.1f} and {row.cost:.3f} {unit} per episode, and {event} "
                 f"in {share(row.violation_rate)} of all."
             )
-            sentences += _worse(rows, row, event)
+            most = max(rows, key=lambda row: row.violation_rate)
+            low, _ = statistics.clopper_pearson(most.violations, most.episodes)
+            if low > 1.5 * row.violation_rate and low - row.violation_rate >= 0.05:  # clearly more than its logs
+                unsafe = share(most.violation_rate)
+                sentences.append(f"{most.label} has {event} in {unsafe} of its episodes, more than the data has.")
     return sentences
-
-
-def _worse(rows: Sequence[Line], logs: Line, event: str) -> list[str]:
-    """Of the method with most violations, where it has clearly more than its logs."""
-    most = max(rows, key=lambda row: row.violation_rate)
-    low, _ = statistics.clopper_pearson(most.violations, most.episodes)
-    if low <= 1.5 * logs.violation_rate or low - logs.violation_rate < 0.05:
-        return []
-    return [f"{most.label} has {event} in {share(most.violation_rate)} of its episodes, more than the data has."]
 
 
 def _nearest(rows: Sequence[Line], limit: str) -> list[str]:

@@ -82,7 +82,9 @@ def train(
     _check_store(data)
     seeds = _seeds(seeds)
     of_kind("changes", changes, Mapping | None, "give a dictionary of settings")
-    _check_counts(chunk=chunk, checkpoint_every=checkpoint_every)
+    for name, value in (("chunk", chunk), ("checkpoint_every", checkpoint_every)):
+        if value is not None:
+            whole_number(name, value, 1)
     if tensorboard:
         _summary_writer()
     require_resolved(data)
@@ -128,12 +130,6 @@ def _check_store(data: EpisodeStore) -> None:
             f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
             "ringfence.datasets.make.make(ringfence.datasets.registry.get(NAME))[0]."
         )
-
-
-def _check_counts(**counts: int | None) -> None:
-    for name, value in counts.items():
-        if value is not None:
-            whole_number(name, value, 1)
 
 
 @contextmanager

@@ -135,7 +135,10 @@ def kinematics_of(
         raise UserError(f"kinematics='{name}' moves in a plane, and these logs are of space; name another.")
     if name is not None and name != "world" and size != axes:
         raise UserError(f"kinematics='{name}' takes {axes} actions an agent, the logs have {size}.")
-    low, high = _bounds(store)
+    bounds = store.card.bounds
+    every = (store.n_agents, size)
+    low = np.broadcast_to(np.asarray(bounds.low, np.float64), every).max(0)  # what every agent can do
+    high = np.broadcast_to(np.asarray(bounds.high, np.float64), every).min(0)
     speeds = np.zeros(1) if motion.velocity is None else np.linalg.norm(motion.velocity, axis=-1)
     fastest = float(np.quantile(speeds, 0.999)) or 1.0
     made = Kinematics(name or KINEMATICS[0], dt, low, high, fastest, motion.late, wheelbase=wheelbase, world=world)
@@ -155,15 +158,6 @@ def kinematics_of(
             f"velocity as kinematics='{fitted.name}' would; name another: {', '.join(KINEMATICS)}."
         )
     return fitted
-
-
-def _bounds(store: EpisodeStore) -> tuple[np.ndarray, np.ndarray]:
-    """(A,) what every agent can do."""
-    size = store.actions.shape[2]
-    bounds = store.card.bounds
-    low = np.broadcast_to(np.asarray(bounds.low, np.float64), (store.n_agents, size))
-    high = np.broadcast_to(np.asarray(bounds.high, np.float64), (store.n_agents, size))
-    return low.max(0), high.min(0)
 
 
 def _fitted(made: Kinematics, store: EpisodeStore, motion: Motion) -> Kinematics:
@@ -214,10 +208,6 @@ def _along(vector: np.ndarray, speed: np.ndarray | float) -> np.ndarray:
     return vector / np.maximum(far, 1e-6) * np.reshape(speed, (-1, 1))
 
 
-def _straight(now: Now) -> np.ndarray:
-    return now.begun
-
-
 def _accelerate(now: Now) -> np.ndarray:
     ahead = np.zeros_like(now.velocity)
     ahead[:, :2] = np.stack([np.cos(now.heading), np.sin(now.heading)], -1)
@@ -227,10 +217,6 @@ def _accelerate(now: Now) -> np.ndarray:
     return _along(ahead, now.max_speed)
 
 
-def _hasty(now: Now) -> np.ndarray:
-    return _along(now.goal, now.max_speed)
-
-
 def _seek(now: Now) -> np.ndarray:
     nearest = np.linalg.norm(now.others, axis=-1).argmin(-1)
     return _along(now.others[np.arange(len(nearest)), nearest], now.max_speed)
@@ -238,9 +224,9 @@ def _seek(now: Now) -> np.ndarray:
 
 # The velocity (W, X) that each of them wants: hold speed and course; speed up ahead; to the goal, fast; to the nearest.
 DRIVERS: dict[str, Callable[[Now], np.ndarray]] = {
-    "straight": _straight,
+    "straight": lambda now: now.begun,
     "accelerate": _accelerate,
-    "hasty": _hasty,
+    "hasty": lambda now: _along(now.goal, now.max_speed),
     "seek": _seek,
 }
 
