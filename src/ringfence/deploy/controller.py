@@ -181,7 +181,12 @@ class Controller:
                 refuse_other_order(agents, self.agents)
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
-            age = self._age(age, observed_at)
+            if observed_at is not None:
+                if age is not None:
+                    raise UserError("age and observed_at both say how old observations are; give one of them.")
+                guarded = guarded_of(self.policy)
+                dt = None if guarded is None else guarded.guard.world.map.dt
+                age = self._stamps.ages(observed_at, source.agents, dt)
             before = self._carry if age is None else self._aged(age)
             key, now = jax.random.split(self._key)
             carry, step = source.act(before, seen, paid, now)
@@ -198,16 +203,6 @@ class Controller:
         if observed_at is not None:
             self._stamps.acted()
         return action
-
-    def _age(self, age: Any, observed_at: Any) -> Any:
-        """How many steps old observations are, as it was given or by their time."""
-        if observed_at is None:
-            return age
-        if age is not None:
-            raise UserError("age and observed_at both say how old observations are; give one of them.")
-        guarded = guarded_of(self.policy)
-        dt = None if guarded is None else guarded.guard.world.map.dt
-        return self._stamps.ages(observed_at, self._source.agents, dt)
 
     @contextmanager
     def _recorded(self) -> Iterator[None]:

@@ -84,7 +84,12 @@ def export(
     resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     action = step_of(resolved.job, resolved.team)
     metadata = metadata_of(resolved, action)
-    count = _operations(action) if format == "onnx" else 0
+    count = operations(jax.make_jaxpr(action.call)(*action.avals).jaxpr) if format == "onnx" else 0
+    if count > MAX_OPERATIONS:
+        raise UserError(
+            f"This policy has {count:,} operations, and more than {MAX_OPERATIONS:,} take hours to write as ONNX; look "
+            "less far ahead (horizon=), or write it as StableHLO."
+        )
     if not quiet and count > MANY:
         print(f"ONNX of {count:,} operations takes some minutes.", file=sys.stderr)
     with Progress(f"{file.name}{f', {count:,} operations' * bool(count)}", 1, 0, quiet) as bar:
@@ -93,17 +98,6 @@ def export(
     with whole(file) as temporary:  # at once: who is stopped while converting leaves nothing
         temporary.write_bytes(content)
     return file
-
-
-def _operations(step: Step) -> int:
-    """How many an ONNX file has to hold; too many are refused."""
-    count = operations(jax.make_jaxpr(step.call)(*step.avals).jaxpr)
-    if count > MAX_OPERATIONS:
-        raise UserError(
-            f"This policy has {count:,} operations, and more than {MAX_OPERATIONS:,} take hours to write as ONNX; look "
-            "less far ahead (horizon=), or write it as StableHLO."
-        )
-    return count
 
 
 # --- metadata ---

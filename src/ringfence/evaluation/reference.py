@@ -40,7 +40,11 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     costs = np.zeros(there.shape)
     costs[there] = store.team_costs
     played = {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": store.episode_terminated}
-    result = summarise({name: array[kept] for name, array in played.items()}, task, _unsafe_starts(store, task)[kept])
+    unsafe = np.zeros(store.episodes, bool)
+    if store.state is not None and task.env is not None:  # a simulator says which starts are unsafe
+        first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
+        unsafe = unsafe_starts(task, store.state[first])
+    result = summarise({name: array[kept] for name, array in played.items()}, task, unsafe[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
 
@@ -63,14 +67,6 @@ def of_run(run: Run, constants: dict[str, Any]) -> dict[str, Any] | None:
     if logs["constraints"]:
         result["constraints"] = {k: of_constraint(np.array(c), limits.get(k)) for k, c in logs["constraints"].items()}
     return result | {"split": "data"}
-
-
-def _unsafe_starts(store: EpisodeStore, task: Task) -> np.ndarray:
-    """(E,) whether a logged episode starts unsafe; False where no simulator says so."""
-    if store.state is None or task.env is None:
-        return np.zeros(store.episodes, bool)
-    first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
-    return unsafe_starts(task, store.state[first])
 
 
 def there(task: Task, out: str | Path, episodes: int, transitions: int | None = None) -> bool:

@@ -60,23 +60,13 @@ def of_run(run: Run) -> list[Row]:
     """Every evaluation that a run folder holds."""
     results = run.results
     config = run.config if results else {}
-    return [_of_run(run, config, name, result) for name, result in results.items()]
-
-
-def _of_run(run: Run, config: Mapping[str, Any], name: str, result: Result) -> Row:
-    dated = "@step" in name or of_last_step(result, config["config"])
-    return Row(
-        task=config["task"],
-        algorithm=config["algorithm"],
-        preset=config["preset"],
-        variant=name if dated else f"{name}@step{result['step']}",
-        seed=config["seed"],
-        result=result,
-        file=run.path / "results.json",
-        name=name,
-        run=run,
-        config=config,
-    )
+    found = []
+    for name, result in results.items():
+        dated = "@step" in name or of_last_step(result, config["config"])
+        variant = name if dated else f"{name}@step{result['step']}"
+        who = (config["task"], config["algorithm"], config["preset"], variant, config["seed"])
+        found.append(Row(*who, result, run.path / "results.json", name, run, config))
+    return found
 
 
 def of_references(file: Path, task: str) -> list[Row]:

@@ -109,8 +109,14 @@ def resolve(spec: PolicySpec) -> Resolved:
         state |= {"world": job.algorithm.from_world(world, job.config)}
     policy = make_policy(job, state, {**PLANNERS[spec.planner], **dict(spec.plan_options)})
     plans = isinstance(policy, TakesPlanOptions)
-    if not plans:
-        _refuse_target(job, dict(spec.plan_options))
+    asked = dict(spec.plan_options)
+    if not plans and "target_return" in asked:  # the other options of plans are passed over
+        name = job.algorithm.name
+        remedy = "set it when it is trained" if hasattr(job.config, "target_return") else "leave it out"
+        raise UserError(
+            f"target_return={asked['target_return']} asks for a return, and {name} is asked for none when it plays; "
+            f"{remedy}."
+        )
     if isinstance(policy, TakesGuidance):
         policy = _guided(policy, run, job, world, spec)
     if spec.guarded and spec.barrier == oracle.ORACLE:
@@ -131,17 +137,6 @@ def resolve(spec: PolicySpec) -> Resolved:
     # Homogeneous agents see for themselves anyway.
     spec = dataclasses.replace(spec, execution=None) if job.task.homogeneous else spec
     return Resolved(spec, job, policy, step)
-
-
-def _refuse_target(job: Job, options: dict[str, Any]) -> None:
-    """Whoever draws no plans passes over how they are drawn, but for a return that is asked for in vain."""
-    if "target_return" in options:
-        name = job.algorithm.name
-        remedy = "set it when it is trained" if hasattr(job.config, "target_return") else "leave it out"
-        raise UserError(
-            f"target_return={options['target_return']} asks for a return, and {name} is asked for none when it plays; "
-            f"{remedy}."
-        )
 
 
 def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:

@@ -47,6 +47,18 @@ def build_board(folder: str | Path, out: str | Path, title: str | None = None) -
     out = html.page_file(out)
     lines = [line for some in board.lines.values() for line in some]
     any_line = {line.method: line for line in reversed(lines) if line.method}
+    # (task, method, seeds) trained by an older revision of their algorithm than this package has.
+    found = []
+    for where, of_task in board.lines.items():
+        for one in of_task:
+            known = ALGORITHMS.get(one.method.algorithm) if one.method else None
+            revision = known.revision if known else 1
+            if seeds := [row.seed for row in one.rows if row.config.get("revision", 1) < revision]:
+                found.append((where, one.label, seeds))
+    # (task, job, why, seeds) of cells without a result; seeds that lack it for the same reason share a line.
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for lacking in board.missing:
+        groups.setdefault((lacking.task, lacking.job, lacking.why), []).append(lacking.seed)
     context = {
         "title": title or f"Leaderboard: {board.suite.replace('_', ' ')}",
         "js": "",
@@ -54,13 +66,13 @@ def build_board(folder: str | Path, out: str | Path, title: str | None = None) -
         "draws": DRAWS,
         "rankings": rankings(board),
         "seeds": _seeds(lines),
-        "older": _older(board),
+        "older": found,
         "sections": [_section(board, task, k, out) for k, task in enumerate(board.tasks)],
         "aggregates": [_aggregate(board, a, k, any_line) for k, a in enumerate(aggregates(board))],
         "expenses": expenses([any_line[m] for m in board.methods], "expenses"),
         "published": published(board),
         "note": NOTE,
-        "missing": _missing(board),
+        "missing": [(*job, seeds) for job, seeds in groups.items()],
         "environments": environments([run for each in board.sections.values() for run in each.runs]),
     }
     return html.write(out, html.render(TEMPLATE, context))
@@ -131,18 +143,6 @@ def _seeds(lines: list[Line]) -> str:
     return f"{low} to {high} seeds, {counts.count(most)} of {len(counts)} rows with {most}"
 
 
-def _older(board: Board) -> list[tuple[str, str, list[int]]]:
-    """(task, method, seeds) trained by an older revision of their algorithm than this package has."""
-    found = []
-    for task, lines in board.lines.items():
-        for line in lines:
-            known = ALGORITHMS.get(line.method.algorithm) if line.method else None
-            revision = known.revision if known else 1
-            if seeds := [row.seed for row in line.rows if row.config.get("revision", 1) < revision]:
-                found.append((task, line.label, seeds))
-    return found
-
-
 @dataclass(frozen=True)
 class Ours:
     """What a method of ours earned on the tasks; None where it was not measured."""
@@ -210,14 +210,6 @@ def _link(file: Path, out: Path) -> tuple[str, str]:
     """(text, href): the path from the page's folder."""
     relative = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
     return relative, quote(relative)
-
-
-def _missing(board: Board) -> list[tuple[str, str, str, list[int]]]:
-    """(task, job, why, seeds) of cells without a result; seeds that lack it for the same reason share a line."""
-    groups: dict[tuple[str, str, str], list[int]] = {}
-    for m in board.missing:
-        groups.setdefault((m.task, m.job, m.why), []).append(m.seed)
-    return [(*job, seeds) for job, seeds in groups.items()]
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,12 @@ class Section:
 def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Section]:
     """One section per task of evaluated runs, in the order in which the runs name them."""
     rows: dict[str, list[Row]] = {}
-    for run in _distinct([runs] if isinstance(runs, str | Path | Run) else runs):
+    distinct: dict[Path, Run] = {}  # the same folder named twice counts once
+    for each in [runs] if isinstance(runs, str | Path | Run) else runs:
+        below = [] if isinstance(each, Run) else runs_below(Path(each))
+        for run in below or [Run.of(each)]:
+            distinct.setdefault(run.path.resolve(), run)
+    for run in distinct.values():
         found = of_run(run)
         if not found:
             raise UserError(
@@ -178,16 +183,6 @@ def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Sectio
     if not rows:
         raise UserError("No run was given, so there is nothing to report; pass run folders made by `ringfence train`.")
     return [_section_of_runs(task, mine) for task, mine in rows.items()]
-
-
-def _distinct(runs: Iterable[Run | str | Path]) -> list[Run]:
-    """Folders become runs; the same folder named twice counts once."""
-    found: dict[Path, Run] = {}
-    for each in runs:
-        below = [] if isinstance(each, Run) else runs_below(Path(each))
-        for run in below or [Run.of(each)]:
-            found.setdefault(run.path.resolve(), run)
-    return list(found.values())
 
 
 def _section_of_runs(task: str, rows: list[Row]) -> Section:

@@ -300,7 +300,15 @@ class _Training:
         arrays: Arrays = {}
         for run, seed, root in zip(runs, seeds, roots):
             world, windows = lessons.of(seed)
-            states.append(_begun(job, run, root, world, windows))
+            # A seed's state: fresh, or that of its last checkpoint. The World that it reads is kept beside it.
+            read = {} if world is None else {"world": world}
+            key = jax.random.fold_in(root, 2**31 - 1)
+            begun = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **read)
+            if world is not None and not (run.path / worlds.WORLD).exists():
+                save_world(world, run.path / worlds.WORLD)
+            if run.checkpoints():
+                begun = begun | run.load_checkpoint(learned(begun))[1]
+            states.append(begun)
             scores.append(windows.arrays["scores"])
             arrays = {name: array for name, array in windows.arrays.items() if name != "scores"}
         steps = sorted({int(state["step"]) for state in states})
@@ -393,18 +401,6 @@ class _Training:
         for i, run in enumerate(self.runs):
             run.save_checkpoint(self.step, jax.tree.map(operator.itemgetter(i), host))
         self.saved = self.step
-
-
-def _begun(job: Job, run: Run, root: Key, world: World | None, windows: WindowData) -> PyTree:
-    """A seed's state: fresh, or that of its last checkpoint. The World that it reads is kept beside it."""
-    read = {} if world is None else {"world": world}
-    key = jax.random.fold_in(root, 2**31 - 1)
-    state = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **read)
-    if world is not None and not (run.path / worlds.WORLD).exists():
-        save_world(world, run.path / worlds.WORLD)
-    if run.checkpoints():
-        state = state | run.load_checkpoint(learned(state))[1]
-    return state
 
 
 @jax.jit  # one program, and not one for each shape

@@ -407,9 +407,15 @@ def _radius_of_causes(causes: Mapping[str, Found], axes: int) -> tuple[float, st
 def rows_of(stage: Stage, played: Played) -> list[Row]:
     logged = int((stage.windows.nearest_logged[:, 1:] < stage.radius).any(-1).sum())
     plain = played.plain.contact
+    driven = stage.windows.driven
     made = []
     for filter, found in {"none": played.plain, **played.under}.items():
         clearance = found.info.get("clearance")
+        by_agent = []
+        for agent in np.unique(driven):
+            own = driven == agent
+            info = {name: float(value[own].mean()) for name, value in found.info.items() if name != FORESEEN}
+            by_agent.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **info})
         made.append(
             Row(
                 policy=played.name,
@@ -423,7 +429,7 @@ def rows_of(stage: Stage, played: Played) -> list[Row]:
                 infeasible=_share(found, "infeasible"),
                 ood=_share(found, "ood"),
                 margin=None if clearance is None else float(np.median(clearance)),
-                by_agent=_by_agent(stage.windows.driven, found),
+                by_agent=tuple(by_agent),
             )
         )
     return made
@@ -431,16 +437,6 @@ def rows_of(stage: Stage, played: Played) -> list[Row]:
 
 def _share(found: Driven, name: str) -> float | None:
     return float(found.info[name].mean()) if name in found.info else None
-
-
-def _by_agent(driven: np.ndarray, found: Driven) -> tuple[dict[str, Any], ...]:
-    """What the guard says while each agent is driven."""
-    made = []
-    for agent in np.unique(driven):
-        own = driven == agent
-        info = {name: float(value[own].mean()) for name, value in found.info.items() if name != FORESEEN}
-        made.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **info})
-    return tuple(made)
 
 
 def _film(stage: Stage, played: Played, guard: str) -> Film:

@@ -70,18 +70,15 @@ class Kinematics:
         elif self.name in LINEAR:
             after = (1 - self.drag) * velocity + self.gain * action
         else:
-            heading, after = self._turned(velocity, heading, action)
+            speed = (velocity * _unit(heading)).sum(-1)
+            rate = action[:, 1] if self.name == "unicycle" else speed / self.wheelbase * np.tan(action[:, 1])
+            heading = heading + rate * self.dt
+            after = (speed + action[:, 0] * self.dt)[:, None] * _unit(heading)
         speed = np.linalg.norm(after, axis=-1, keepdims=True)
         after = after * np.minimum(1.0, self.max_speed / np.maximum(speed, 1e-9))
         if self.name in ("world", *LINEAR):
             heading = np.where(speed[:, 0] > SLOW, np.arctan2(after[:, 1], after[:, 0]), heading)
         return place + ((1 - self.late) * velocity + self.late * after) * self.dt, after, heading
-
-    def _turned(self, velocity, heading, action) -> tuple[np.ndarray, np.ndarray]:
-        speed = (velocity * _unit(heading)).sum(-1)
-        rate = action[:, 1] if self.name == "unicycle" else speed / self.wheelbase * np.tan(action[:, 1])
-        heading = heading + rate * self.dt
-        return heading, (speed + action[:, 0] * self.dt)[:, None] * _unit(heading)
 
     def toward(self, wanted: np.ndarray, velocity: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """(W, A) the action within bounds that leads to a velocity (W, X) soonest."""
