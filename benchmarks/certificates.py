@@ -101,7 +101,7 @@ def played(setting: str, margin: float, batch: int, episodes: int) -> dict[str, 
     from ringfence.deploy import zoo
     from ringfence.evaluation.certify import shortfalls
     from ringfence.evaluation.compensation import compensated
-    from ringfence.evaluation.rollout import rollout
+    from ringfence.evaluation.protocol import rollout
     from ringfence.faults import Faults
     from ringfence.faults.policy import under_faults
     from ringfence.loading.resolve import resolve

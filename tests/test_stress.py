@@ -28,7 +28,7 @@ from ringfence.evaluation.certificate import Certificate, Monitor, digest
 from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.compensation import compensated, compensation, own_acceleration
 from ringfence.evaluation.evaluate import evaluate
-from ringfence.evaluation.rollout import rollout
+from ringfence.evaluation.protocol import rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import FILE
 from ringfence.faults import Faults
@@ -406,7 +406,7 @@ def test_faults_are_called_so_in_the_help(capsys):
 
 @pytest.fixture
 def few(monkeypatch):
-    monkeypatch.setattr("ringfence.evaluation.rollout.CHUNK", 4)
+    monkeypatch.setattr("ringfence.evaluation.protocol.CHUNK", 4)
 
 
 def test_a_quantile_of_few_episodes_is_none():

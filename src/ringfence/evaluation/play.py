@@ -25,8 +25,8 @@ from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
 from ringfence.evaluation.player import HasPolicy, Player, RunPlayer, player_of
+from ringfence.evaluation.protocol import COUNTED, RESETS, Acting
 from ringfence.evaluation.recordings import Places, Recording, filled, recording, watching
-from ringfence.evaluation.rollout import COUNTED, RESETS, Acting
 from ringfence.faults import Faults
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.names import Names
