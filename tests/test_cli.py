@@ -11,8 +11,8 @@ import pytest
 from rich.table import Table
 
 from ringfence.cli.app import main
-from ringfence.cli.console import console
 from ringfence.cli.first import demonstrate
+from ringfence.cli.shared import console
 from ringfence.errors import UserError
 from ringfence.evaluation import protocol
 from ringfence.guards import GUARDS

@@ -29,7 +29,9 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
+
+import jax
 
 from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group, tell_lost
 from ringfence.errors import UserError
@@ -236,8 +238,7 @@ def resident(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
 
 
-if TYPE_CHECKING:  # a worker says that it is there before it imports JAX
-    from ringfence.bench.cells import Cell
+# --- a worker ---
 
 
 def encode(cell: Cell) -> dict[str, Any]:
@@ -245,8 +246,6 @@ def encode(cell: Cell) -> dict[str, Any]:
 
 
 def decode(message: dict[str, Any]) -> Cell:
-    from ringfence.bench.cells import Cell
-
     pairs = {name: tuple(tuple(pair) for pair in message[name]) for name in ("changes", "evaluations", "trials")}
     return Cell(**{**message, **pairs})
 
@@ -264,8 +263,6 @@ def leave_with(parent: int) -> None:
 
 def forget() -> None:
     """Let go of compiled programs: the next job's are others, and kept they grow a worker by 80 MiB a small job."""
-    import jax
-
     jax.clear_caches()
     gc.collect()
 
@@ -278,9 +275,6 @@ def main() -> None:
     def say(**message: Any) -> None:
         print(json.dumps(message), file=wire, flush=True)
 
-    from ringfence.bench import cells as grid
-    from ringfence.utils import interrupts
-
     interrupts.listen()
     say(event="ready")
     for line in sys.stdin:
@@ -288,16 +282,19 @@ def main() -> None:
         out = Path(job["out"])
         try:
             if "reference" in job:
-                grid.make_reference(job["reference"], out, job["episodes"], job["transitions"])
+                make_reference(job["reference"], out, job["episodes"], job["transitions"])
             else:
                 group = [decode(c) for c in job["cells"]]
-                grid.run_group(group, out, job["episodes"], lambda event, cell: say(event=event, cell=encode(cell)))
+                run_group(group, out, job["episodes"], lambda event, cell: say(event=event, cell=encode(cell)))
             say(event="finished")
         except KeyboardInterrupt:
             return
         except Exception as error:
             say(event="broken", error=f"{type(error).__name__}: {error}")
         forget()
+
+
+# --- Ray ---
 
 
 def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: bool = False) -> dict[str, int]:

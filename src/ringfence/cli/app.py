@@ -16,9 +16,22 @@ from rich.text import Text
 from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
-from ringfence.cli.console import Refusals, complain, console, plain_warnings
 from ringfence.cli.first import demonstrate, doctor
-from ringfence.cli.flags import AS_IT_IS, AS_LOGGED, NO_FAULTS, Assignments, How, Playing, Replayed, Wrong, assignments
+from ringfence.cli.shared import (
+    AS_IT_IS,
+    AS_LOGGED,
+    NO_FAULTS,
+    Assignments,
+    How,
+    Playing,
+    Refusals,
+    Replayed,
+    Wrong,
+    assignments,
+    complain,
+    console,
+    plain_warnings,
+)
 from ringfence.errors import Interrupted, UserError, one_of, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import lines, terminal

@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
-from ringfence.cli.console import complain, console
+from ringfence.cli.shared import complain, console
 from ringfence.errors import UserError, one_of
 from ringfence.utils.escape import terminal
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from ringfence.cli.console import console
+from ringfence.cli.shared import console
 from ringfence.errors import UserError
 
 out = console()

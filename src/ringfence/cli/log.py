@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from ringfence.cli.console import console
+from ringfence.cli.shared import console
 from ringfence.errors import whole_number
 from ringfence.utils.escape import lines
 

@@ -344,11 +344,15 @@ def _rollout_native(
     outside.rollout(Acting(policy), simulation, keep, keys)
     played = _stacked(steps)
     states = np.stack([one.state for one in seen if one.state is not None], 1)  # robots have one
+    after = env.episode_length - len(steps)  # rows in which nothing happens, and the last state stays
     return {
         "steps": np.asarray(played.pop("steps").sum(1)),
         "terminated": np.asarray(played.pop("terminated").any(1)),
-        "states": _held(states, env.episode_length + 1),
-        **{k: _padded(x, env.episode_length, -np.inf if k == FORESEEN else 0.0) for k, x in played.items()},
+        "states": np.concatenate([states, np.repeat(states[:, -1:], after, 1)], 1),
+        **{
+            name: np.pad(x, ((0, 0), (0, after)), constant_values=-np.inf if name == FORESEEN else 0.0)
+            for name, x in played.items()
+        },
         **_stacked(drawn),
     }
 
@@ -370,14 +374,3 @@ def _foreign(policy: Policy) -> bool:
 def _stacked(steps: Sequence[dict[str, Any]]) -> Played:
     """Arrays (E, T, ...) of what every step kept; nothing of no steps."""
     return {name: np.stack([step[name] for step in steps], 1) for name in (steps[0] if steps else ())}
-
-
-def _padded(x: np.ndarray, length: int, after: float = 0.0) -> np.ndarray:
-    """(E, length) from (E, T): nothing happens after the end."""
-    return np.pad(x, ((0, 0), (0, length - x.shape[1])), constant_values=after)
-
-
-def _held(states: np.ndarray, length: int) -> np.ndarray:
-    """(E, length, S) from (E, T, S): the last state stays."""
-    rest = np.repeat(states[:, -1:], length - states.shape[1], 1)
-    return np.concatenate([states, rest], 1)

@@ -220,9 +220,9 @@ def danger(hazard: dict[str, Any]) -> str:
     return f"a distance below {hazard['radius']:g} m" if hazard.get("kind") == "Separation" else ""
 
 
-def headline(section: Section, split: str = "test") -> list[str]:
-    """The outcome in plain sentences, from the numbers of a split."""
-    rows = section.tables.get(split, [])
+def headline(section: Section) -> list[str]:
+    """The outcome in plain sentences, from the numbers of test resets."""
+    rows = section.tables.get("test", [])
     if not rows:
         return ["Only validation results exist: settings can be chosen from them, but no result can be claimed."]
     unit, event = words_of(section.hazard)

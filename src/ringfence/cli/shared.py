@@ -1,17 +1,28 @@
-"""Flags that several commands share: how a run is played, how logs are replayed, what goes wrong in a closed loop."""
+"""What commands share: flags of how a run is played, how logs are replayed and what goes wrong in a closed loop; and
+what is said to a person."""
 
 from __future__ import annotations
 
 import dataclasses
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+from rich.console import Console
+from rich.markup import escape
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, plain
 from ringfence.faults.faults import Chance, Faults
 
+if TYPE_CHECKING:
+    from ringfence.training.runs import Run
+
+WIDE = 1000  # columns of what is no terminal: nothing is cut that another program, or a file, is to read
 # --set a=1 b=2 and --set a=1 --set b=2 mean the same.
 Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
 
@@ -138,3 +149,34 @@ class FaultFlags(Faults):
 
 NO_FAULTS = FaultFlags()
 Wrong = Annotated[tyro.conf.OmitArgPrefixes[FaultFlags], tyro.conf.arg(name="faults")]
+
+
+def console() -> Console:
+    """Of stdout, as wide as its terminal."""
+    terminal = sys.stdout is not None and sys.stdout.isatty()  # None: it was closed
+    return Console(highlight=False, width=None if terminal else WIDE)
+
+
+def complain(message: str) -> None:
+    """Say on stderr what is wrong."""
+    Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+def plain_warnings() -> None:
+    """Have warnings say what they say, and not where in the code."""
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {plain(str(message))}\n"
+
+
+@dataclass
+class Refusals:
+    """Why runs were refused, so that what several are refused for is said once."""
+
+    runs: dict[str, list[Run]] = field(default_factory=dict)  # by message
+
+    @contextmanager
+    def of(self, run: Run) -> Iterator[None]:
+        """Note down a refusal of this run and go on."""
+        try:
+            yield
+        except UserError as error:
+            self.runs.setdefault(str(error), []).append(run)
