@@ -199,10 +199,10 @@ def evaluate(
     found = _some_runs(runs)
     if video:
         from ringfence.loading.resolve import load_job
-        from ringfence.report import video as films
+        from ringfence.report.video import check
 
         for run in {run.config["task"]: run for run in found}.values():
-            films.check(load_job(run).task)
+            check(load_job(run).task)
         num_recorded = num_recorded or 1
     given |= {
         "episodes": episodes,
@@ -230,7 +230,9 @@ def evaluate(
             table.add_row(*_evaluated(run, result))
             doubts += _doubt(result)
             if video:
-                print(films.film(run, result["variant"]))
+                from ringfence.report.video import film
+
+                print(film(run, result["variant"]))
     _say(table, refusals, len(found), doubts)
 
 

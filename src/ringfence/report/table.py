@@ -300,7 +300,11 @@ def pool(results: list[Result], name: str = "the runs of a line") -> Numbers:
     measured = _of_one(results[0]) if len(results) == 1 else _of_several(results, name)
     constants = results[0]["constants"]
     limits = limits_of(results)
-    kept = all(_keeps(result, limits) for result in results)
+    costs = [(r.get("constraints", {}).get(name, {}), limit) for r in results for name, limit in limits.items()]
+    # By the upper ends of the costs' intervals; what was not measured is not kept.
+    kept = all(c and not c.get("cost_interval", (0.0, c["cost_mean"]))[1] > limit for c, limit in costs)
+    means = [(c.get("cost_mean", np.inf), limit) for c, limit in costs]
+    shares = [cost / limit if limit > 0 else np.inf if cost > 0 else 0.0 for cost, limit in means]  # 1 at the limit
     return Numbers(
         **measured,
         episodes=sum(r["episodes"] for r in results),
@@ -308,7 +312,7 @@ def pool(results: list[Result], name: str = "the runs of a line") -> Numbers:
         cost_sd=_deviation(results, "cost_mean"),
         violations=sum(map(_violations, results)),
         returns_norm=normal_return(measured["returns"], constants),
-        cost_norm=_worst_share(results, limits) if limits else normal_cost(measured["cost"], constants),
+        cost_norm=float(max(0.0, *shares)) if limits else normal_cost(measured["cost"], constants),
         safe=kept and measured["cost_interval"][1] <= constants["cost_limit"],
         limits=limits,
     )
@@ -327,25 +331,6 @@ def limits_of(results: Iterable[Result]) -> dict[str, float]:
             if constraint.get("limit") is not None:
                 limits[name] = min(constraint["limit"], limits.get(name, constraint["limit"]))
     return limits
-
-
-def _keeps(result: Result, limits: Mapping[str, float]) -> bool:
-    """Whether a run keeps every limit, by the upper ends of the costs' intervals; what was not measured is not kept."""
-    for name, limit in limits.items():
-        measured = result.get("constraints", {}).get(name)
-        if measured is None or measured.get("cost_interval", (0.0, measured["cost_mean"]))[1] > limit:
-            return False
-    return True
-
-
-def _worst_share(results: Iterable[Result], limits: Mapping[str, float]) -> float:
-    """Of the constraints' mean costs the largest as a share of its own limit: 1 at the limit."""
-    shares = [0.0]
-    for result in results:
-        for name, limit in limits.items():
-            cost = result.get("constraints", {}).get(name, {}).get("cost_mean", np.inf)
-            shares.append(cost / limit if limit > 0 else np.inf if cost > 0 else 0.0)
-    return float(max(shares))
 
 
 def _of_one(result: Result) -> dict[str, Any]:
