@@ -67,8 +67,8 @@ REFERENCE = {
         "ringfence.evaluation.reference",
         "ringfence.deploy.zoo",
     ),
-    "Off-policy evaluation": ("ringfence.evaluation.ope.estimate", "ringfence.evaluation.ope.result"),
-    "Replay": ("ringfence.evaluation.replay.judge",),
+    "Off-policy evaluation": ("ringfence.evaluation.ope", "ringfence.evaluation.ope_result"),
+    "Replay": ("ringfence.evaluation.replay",),
     "Export": ("ringfence.deploy.export",),
     "World": ("ringfence.training.worlds", "ringfence.world"),
     "Parts of a World": (

@@ -30,8 +30,8 @@ from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.play import name_of, play_all, simulators_of
 from ringfence.evaluation.player import player_of_run
 from ringfence.evaluation.protocol import FORESEEN, RESETS, Played, rollout
-from ringfence.evaluation.replay.judge import Body, Logs
-from ringfence.evaluation.replay.stage import Stage
+from ringfence.evaluation.replay import Body, Logs
+from ringfence.evaluation.replay_stage import Stage
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import check_simulator
 from ringfence.faults import Faults

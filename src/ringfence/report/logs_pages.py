@@ -12,8 +12,8 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from ringfence.datasets.audit import Audit
-from ringfence.evaluation.ope.result import OPEResult, Safety
-from ringfence.evaluation.replay.judge import Film, ReplayResult
+from ringfence.evaluation.ope_result import OPEResult, Safety
+from ringfence.evaluation.replay import Film, ReplayResult
 from ringfence.report import html
 from ringfence.report.figures import INK, Drawn, figure, style, to_svg
 from ringfence.world import Card

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import LAST_SEED, UserError, of_kind, whole_number
-from ringfence.evaluation.ope.responses import Logs, Respondent, behaviour, rollout, safety
-from ringfence.evaluation.ope.result import UNKNOWN, LogsRead, Mean, OPEResult, Values
+from ringfence.evaluation.ope_responses import Logs, Respondent, behaviour, rollout, safety
+from ringfence.evaluation.ope_result import UNKNOWN, LogsRead, Mean, OPEResult, Values
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore

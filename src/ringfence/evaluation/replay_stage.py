@@ -18,7 +18,7 @@ from ringfence.envs.base import Outcome, Seed, Seen
 from ringfence.envs.rollout import Memoryless, Moment, rollout, split_off
 from ringfence.errors import UserError, known
 from ringfence.evaluation.protocol import FORESEEN, Acting
-from ringfence.evaluation.replay.scene import Motion, Windows
+from ringfence.evaluation.replay_scene import Motion, Windows
 from ringfence.faults import Faults
 from ringfence.faults.policy import behind
 from ringfence.guards import Guard

@@ -15,8 +15,9 @@ from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, known, of_kind, whole_number
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.protocol import FORESEEN
-from ringfence.evaluation.replay.scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
-from ringfence.evaluation.replay.stage import DRIVERS, Driven, Stage, kinematics_of
+from ringfence.evaluation.replay_scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
+from ringfence.evaluation.replay_stage import DRIVERS, Driven, Stage, kinematics_of
+from ringfence.evaluation.replay_stage import KINEMATICS as KINEMATICS
 from ringfence.evaluation.statistics import clopper_pearson
 from ringfence.faults import Faults
 from ringfence.guards import GUARDS, Guard

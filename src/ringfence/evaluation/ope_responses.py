@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.evaluation import statistics
-from ringfence.evaluation.ope.result import Behaviour, Mean, ModelRollout, Safety
+from ringfence.evaluation.ope_result import Behaviour, Mean, ModelRollout, Safety
 from ringfence.guards import BarrierSource
 from ringfence.guards.policy import Guarded
 from ringfence.logs.store import EpisodeStore
