@@ -204,47 +204,26 @@ def evaluate(
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
         num_recorded = num_recorded or 1
-    given |= {
-        "episodes": episodes,
-        "split": split,
-        "num_recorded": num_recorded,
-        "checkpoint": checkpoint,
-        "quiet": False,
-    }
-    names = (
-        "run",
-        "variant",
-        "return",
-        "cost",
-        "safe starts",
-        "unsafe episodes (95 % ≤)",
-        "return norm",
-        "cost norm",
-    )
+    given |= {"episodes": episodes, "split": split, "num_recorded": num_recorded, "checkpoint": checkpoint}
+    names = ("run", "variant", "return", "cost", "safe starts", "unsafe episodes (95 % ≤)", "return norm", "cost norm")
     table = Table(*names, "ended early")
     doubts: list[str] = []
     refusals = Refusals()
     for run in found:
         with refusals.of(run):
-            result = with_world(run_evaluation, run, **given)
+            result = with_world(run_evaluation, run, quiet=False, **given)
             table.add_row(*_evaluated(run, result))
-            doubts += _doubt(result)
+            share = result.get("infeasible_rate", 0.0)
+            if share > OFTEN:  # it has no column
+                doubts.append(
+                    f"{result['variant']}: in {100 * share:.2g} % of the steps the guard found no action that keeps "
+                    "its margin; it took the best one that it found, which may be unsafe."
+                )
             if video:
                 from ringfence.report.video import film
 
                 print(film(run, result["variant"]))
     _say(table, refusals, len(found), doubts)
-
-
-def _doubt(result: dict[str, Any]) -> list[str]:
-    """What a guard could not do, where that was often; it has no column."""
-    share = result.get("infeasible_rate", 0.0)
-    if not share > OFTEN:
-        return []
-    return [
-        f"{result['variant']}: in {100 * share:.2g} % of the steps the guard found no action that keeps its margin; it "
-        "took the best one that it found, which may be unsafe."
-    ]
 
 
 def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
@@ -298,16 +277,8 @@ def play(
     faults = wrong.faults()
     found = _some_runs(runs)
     make = simulator(env)
-    given |= {
-        "episodes": episodes,
-        "split": split,
-        "num_envs": num_envs,
-        "early_ends": early_ends,
-        "faults": faults,
-        "compensate": compensate,
-        "keep": not faults.given,
-        "quiet": False,
-    }
+    given |= {"episodes": episodes, "split": split, "num_envs": num_envs, "early_ends": early_ends}
+    given |= {"faults": faults, "compensate": compensate, "keep": not faults.given, "quiet": False}
     table = Table("run", "guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
     refusals = Refusals()
     for run in found:
@@ -379,14 +350,8 @@ def stress(
     faults = wrong.faults()
     given = playing.arguments()
     found = _some_runs(runs)
-    given |= {
-        "episodes": episodes,
-        "split": split,
-        "checkpoint": checkpoint,
-        "compensate": compensate,
-        "make_env": None if env is None else simulator(env),
-        "quiet": False,
-    }
+    given |= {"episodes": episodes, "split": split, "checkpoint": checkpoint, "compensate": compensate}
+    given |= {"make_env": None if env is None else simulator(env), "quiet": False}
     names = ("guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
     table = Table("run", Column("faults", no_wrap=True), *names)
     refusals = Refusals()
