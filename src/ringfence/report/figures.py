@@ -306,7 +306,13 @@ def field(run: Run, state: np.ndarray | None, name: str) -> Drawn | None:
         cases[f"approaching at {SPEED:g} m/s"] = SPEED
     shape = (len(GRID_SIDE), len(GRID_SIDE))
     fields = {case: barrier(around.states(speed))[:, AGENT].reshape(shape) for case, speed in cases.items()}
-    about = "; ".join(_agreement(case, h, radius) for case, h in fields.items())
+    dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
+    contact = np.maximum(np.hypot(dx, dy), 1e-6) < radius
+    told = []
+    for case, h in fields.items():
+        inside, outside = (100 * float((h[part] < 0).mean()) for part in (contact, ~contact))
+        told.append(f"{case}, h < 0 on {inside:.0f} % of the area in contact and on {outside:.0f} % of the rest")
+    about = "; ".join(told)
     label = f"Learned barrier of agent {AGENT} around it. With the other agent {about}."
     rest = around.rest
     rings = ("", "Rings: the remaining agent, where in view. ", "Rings: the remaining agents, where in view. ")
@@ -377,22 +383,3 @@ def _draw_fields(fields: dict[str, np.ndarray], radius: float, rest: np.ndarray,
         bar = made.colorbar(axes[-1].images[0], ax=list(axes), shrink=0.85)
         bar.set_label("h  (negative: judged unsafe)")
         return to_svg(made, label, name)
-
-
-def _agreement(case: str, h: np.ndarray, radius: float) -> str:
-    """How well the sign of h tells contact, in words."""
-    dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
-    contact = np.maximum(np.hypot(dx, dy), 1e-6) < radius
-    inside = 100 * float((h[contact] < 0).mean())
-    outside = 100 * float((h[~contact] < 0).mean())
-    return f"{case}, h < 0 on {inside:.0f} % of the area in contact and on {outside:.0f} % of the rest"
-
-
-def lonely_state(states: np.ndarray, n: int) -> np.ndarray:
-    """Of recorded states (R, L+1, S), the one in which agent 0 is farthest from the agents 2, 3, ...: they must not
-    decide its barrier."""
-    flat = states.reshape(-1, states.shape[-1])
-    position = flat[:, : 2 * n].reshape(-1, n, 2)
-    if n < 3:
-        return flat[0]
-    return flat[np.linalg.norm(position[:, 2:] - position[:, :1], axis=-1).min(1).argmax()]

@@ -199,12 +199,17 @@ def _fields(section: Section, k: int) -> list[dict[str, Any]]:
 
 
 def _lonely_state(run: Run, n: int) -> np.ndarray | None:
-    """A recorded state in which nobody but one other agent is near agent 0; None where none was kept."""
+    """A recorded state in which agent 0 is farthest from the agents 2, 3, ...: they must not decide its barrier. None
+    where none was kept."""
     for variant in run.results:
         recorded = recordings.read(run.path, variant)
         if recorded is not None and "states" in recorded:
-            states = recorded["states"]
-            return figures.lonely_state(states, n) if states.shape[-1] == 6 * n else None
+            flat = recorded["states"].reshape(-1, recorded["states"].shape[-1])
+            if flat.shape[-1] != 6 * n:
+                return None
+            position = flat[:, : 2 * n].reshape(-1, n, 2)
+            far = np.linalg.norm(position[:, 2:] - position[:, :1], axis=-1)
+            return flat[far.min(1).argmax()] if n > 2 else flat[0]
     return None
 
 
