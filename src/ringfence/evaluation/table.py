@@ -94,7 +94,9 @@ def check(rows: Iterable[Row], declared: Mapping[str, Any] | None = None, by: st
             for name in ("protocol",) if row.split == "data" else ("protocol", "split", "episodes"):
                 _check_same(row, name, declared[name], by)
         _check_same(row, "constants", leader.result["constants"], leader.where)
-        first = row if row.run is None else trained.setdefault(row.task, row)
+        if row.run is None:
+            continue
+        first = trained.setdefault(row.task, row)
         if unlike := other_data(row.data, first.data):
             what, here, there = unlike[0]
             raise UserError(
