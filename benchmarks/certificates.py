@@ -101,7 +101,7 @@ def played(setting: str, margin: float, batch: int, episodes: int) -> dict[str, 
     from ringfence.deploy import zoo
     from ringfence.evaluation.certify import shortfalls
     from ringfence.evaluation.compensation import compensated
-    from ringfence.evaluation.rollout import rollout
+    from ringfence.evaluation.protocol import rollout
     from ringfence.faults import Faults
     from ringfence.faults.policy import under_faults
     from ringfence.loading.resolve import resolve
@@ -265,7 +265,7 @@ def case(what: str, promised: float, rate: float) -> dict[str, Any]:
 
 def first_alarm(promised: float, violated: np.ndarray) -> float:
     """The episode after which the alarm is raised; infinite where it never is."""
-    from ringfence.evaluation.monitor import Monitor
+    from ringfence.evaluation.certificate import Monitor
 
     monitor = Monitor(promised)
     for k, one in enumerate(violated):

@@ -23,7 +23,7 @@ from common import RESULTS, write
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.deploy import export
-from ringfence.evaluation import rollout
+from ringfence.evaluation import protocol
 from ringfence.loading.resolve import load
 from ringfence.training import worlds
 from ringfence.types import act_with
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     cells = parser.parse_args().folder / "cells" / TASK
     env = registry.get(TASK).env
-    state = env.reset(jax.random.fold_in(jax.random.key(rollout.RESETS["test"]), 0), STATES)
+    state = env.reset(jax.random.fold_in(jax.random.key(protocol.RESETS["test"]), 0), STATES)
     store = make(registry.get(OTHER))[0]
     some = np.random.default_rng(0).choice(len(store.observations), STATES, replace=False)
     seen = np.concatenate([env.observe(state), store.observations[some]])

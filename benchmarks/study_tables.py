@@ -16,7 +16,7 @@ from families import FAMILIES
 from scipy.stats import spearmanr
 from stress import FAULTS, KNOWN, in_words, name_of
 
-from ringfence.report.published import PUBLISHED
+from ringfence.report.board_page import PUBLISHED
 
 Rows = list[dict[str, str]]
 

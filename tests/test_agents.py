@@ -16,7 +16,7 @@ from ringfence import world as world_files
 from ringfence.deploy import export as exporting
 from ringfence.envs.episode import Episode, Shape
 from ringfence.errors import NoSafeAction, StoreError, UserError
-from ringfence.evaluation.replay.judge import check_view
+from ringfence.evaluation.replay import check_view
 from ringfence.loading.resolve import resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.io.observe import observe

@@ -15,7 +15,7 @@ from ringfence.algos import icbf
 from ringfence.datasets import registry
 from ringfence.deploy.controller import Controller
 from ringfence.errors import CheckpointError, UserError
-from ringfence.evaluation import protocol, rollout
+from ringfence.evaluation import protocol
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
 from ringfence.loading.resolve import load
@@ -347,11 +347,11 @@ def test_paired_resets(trained):
     task = registry.get("simple_spread-random")
     _, bc = load(trained["bc"])
     _, other = load(trained["bc-safe"])
-    a = rollout.rollout(bc, task.env, 60)["states"]
-    b = rollout.rollout(other, task.env, 3)["states"]
+    a = protocol.rollout(bc, task.env, 60)["states"]
+    b = protocol.rollout(other, task.env, 3)["states"]
     np.testing.assert_array_equal(a[:3, 0], b[:, 0])
-    np.testing.assert_array_equal(a[:3], rollout.rollout(bc, task.env, 3)["states"])
-    validation = rollout.rollout(bc, task.env, 3, "validation")["states"]
+    np.testing.assert_array_equal(a[:3], protocol.rollout(bc, task.env, 3)["states"])
+    validation = protocol.rollout(bc, task.env, 3, "validation")["states"]
     assert not np.array_equal(a[:3, 0], validation[:, 0])
 
 
@@ -619,8 +619,8 @@ def test_no_more_is_recorded_than_was_played(trained):
     with np.load(trained["madiff"].path / "rollout-default+sampling_steps2.npz") as kept:
         assert {len(kept[k]) for k in kept} == {2}
     _, policy = load(trained["madiff"], sampling_steps=2)  # more than are played in one batch
-    played = rollout.rollout(policy, registry.get("simple_spread-random").env, rollout.CHUNK + 3, num_recorded=51)
-    assert len(played["plans"]) == 51 and len(played["states"]) == rollout.CHUNK + 3
+    played = protocol.rollout(policy, registry.get("simple_spread-random").env, protocol.CHUNK + 3, num_recorded=51)
+    assert len(played["plans"]) == 51 and len(played["states"]) == protocol.CHUNK + 3
 
 
 def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trained, tmp_path, capsys, monkeypatch):

@@ -20,9 +20,8 @@ import pytest
 
 from ringfence.bench import cells as grid
 from ringfence.bench import (
-    cluster,
     collected,
-    local,
+    engines,
     make_grid,
     make_grids,
     pack,
@@ -34,8 +33,8 @@ from ringfence.bench import (
     suites,
     write_csv,
 )
+from ringfence.bench.engines import decode, encode
 from ringfence.bench.stressed import Trial
-from ringfence.bench.worker import decode, encode
 from ringfence.cli.app import _runs, main
 from ringfence.datasets import registry
 from ringfence.errors import UserError
@@ -204,7 +203,7 @@ def test_the_papers_grids_are_refused_or_made_as_a_whole(tmp_path, capsys):
 
 
 def test_a_reference_whose_worker_dies_is_reported(made, caplog):
-    pool = local._Pool(made, queue.Queue(), None, 1, 2.0, -1)
+    pool = engines._Pool(made, queue.Queue(), None, 1, 2.0, -1)
     dead, job = SimpleNamespace(pid=1, returncode=-9), {"reference": "simple_spread-random"}
     pool._died(dead, None, [], job)
     assert pool.jobs.get_nowait() == job and not caplog.text, "tried again"
@@ -222,9 +221,9 @@ def test_a_folder_that_was_moved_aside_is_found(made, tmp_path):
     cell = dataclasses.replace(made.cells[0])
     folder = cell.folder(tmp_path)
     shutil.copytree(cell.folder(made.out), folder)
-    kept = cluster.begun(cell, tmp_path)
+    kept = engines.begun(cell, tmp_path)
     folder.replace(folder.with_name(f".{folder.name}.old"))
-    assert len(cluster.begun(cell, tmp_path)) == len(kept) and folder.exists()
+    assert len(engines.begun(cell, tmp_path)) == len(kept) and folder.exists()
     shutil.copytree(folder, folder.with_name(f".{folder.name}.part"))
     assert [r.path for r in _runs([tmp_path])] == [folder]
 
@@ -416,9 +415,9 @@ def test_a_killed_runner_loses_no_finished_cell(tmp_path):
 
 
 def test_workers_keep_to_cores_of_their_own_only_where_they_fill_the_machine():
-    assert local.slots_of([0, 1, 2, 3], 2, 2) == [[0, 1], [2, 3]]
-    assert local.slots_of([0, 1], 3, 1) == [[0], [1], []]
-    assert local.slots_of([0, 1], 1, 1) == [[]], "another grid beside it would keep to the same core"
+    assert engines.slots_of([0, 1, 2, 3], 2, 2) == [[0, 1], [2, 3]]
+    assert engines.slots_of([0, 1], 3, 1) == [[0], [1], []]
+    assert engines.slots_of([0, 1], 1, 1) == [[]], "another grid beside it would keep to the same core"
 
 
 def test_one_runner_per_folder(tmp_path):
@@ -467,7 +466,7 @@ def test_a_cell_that_failed_before_it_began_is_reported(tmp_path):
 
 def test_an_unreachable_cluster_is_refused(tmp_path):
     pytest.importorskip("ray", reason="ray is an extra")
-    from ringfence.bench.cluster import connect
+    from ringfence.bench.engines import connect
 
     with pytest.raises(UserError, match="No Ray cluster answers at address '127.0.0.1:1'"):
         connect("127.0.0.1:1")
@@ -478,7 +477,7 @@ def test_ray_makes_the_same_cells_and_survives_a_killed_worker(made, tmp_path):
     ray = pytest.importorskip("ray", reason="ray is an extra")
     from ray.cluster_utils import Cluster
 
-    from ringfence.bench import cluster as engine
+    from ringfence.bench import engines as engine
 
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
     # What the driver would make itself is given, so that the tasks begin at once.

@@ -19,11 +19,9 @@ from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation import protocol
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
-from ringfence.report.board import read
-from ringfence.report.board_page import published, rankings
-from ringfence.report.headline import danger
-from ringfence.report.published import PUBLISHED, matches
-from ringfence.report.standings import aggregate, aggregates, contests
+from ringfence.report.board import aggregate, aggregates, contests, read
+from ringfence.report.board_page import PUBLISHED, matches, published, rankings
+from ringfence.report.page import danger
 from ringfence.report.table import Method
 from ringfence.utils.text import latex, markdown, shell, spreadsheet, terminal
 

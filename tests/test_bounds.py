@@ -150,7 +150,7 @@ def test_a_narrower_simulator_is_refused(run):
 
 def test_an_intervention_is_counted_in_each_entrys_own_range(world):
     """A twentieth of the range is little of a turn and nearly all of a speed."""
-    from ringfence.evaluation.ope.responses import CHANGED
+    from ringfence.evaluation.ope_responses import CHANGED
 
     bounds = (world.spec.action_low, world.spec.action_high)
     difference = normalise.to_unit(np.float32([0.02, 0.3]), *bounds) - normalise.to_unit(

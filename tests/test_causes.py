@@ -18,7 +18,7 @@ from ringfence.problem import features
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.motion import Turn
 from ringfence.problem.partners import others as others_of
-from ringfence.report.ope_page import build_ope
+from ringfence.report.logs_pages import build_ope
 from ringfence.world import (
     cause_candidates,
     cause_counts,

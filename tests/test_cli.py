@@ -10,11 +10,11 @@ from dataclasses import replace
 import pytest
 from rich.table import Table
 
-from ringfence.cli import demo
 from ringfence.cli.app import main
-from ringfence.cli.console import console
+from ringfence.cli.first import demonstrate
+from ringfence.cli.shared import console
 from ringfence.errors import UserError
-from ringfence.evaluation import rollout
+from ringfence.evaluation import protocol
 from ringfence.guards import GUARDS
 from ringfence.logs.schema import ARRAYS
 from ringfence.logs.store import EpisodeStore
@@ -170,10 +170,10 @@ def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
 def test_the_whole_job(tmp_path, monkeypatch, capsys):
     """`make demo`, tiny: data, two trainings, evaluations on the same resets, the table and the page."""
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(rollout, "CHUNK", 10)
+    monkeypatch.setattr(protocol, "CHUNK", 10)
     monkeypatch.setitem(GUARDS, "full", {**GUARDS["full"], "horizon": 2, "num_restarts": 2, "correction_steps": 1})
     monkeypatch.setitem(GUARDS, "shield", {"correction_steps": 1, "horizon": 1})
-    page = demo.run(tmp_path / "demo", "random", quick=True)
+    page = demonstrate(tmp_path / "demo", "random", quick=True)
     text = page.read_text()
     assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
     results = [json.loads(f.read_text()) for f in (tmp_path / "demo").rglob("results.json")]

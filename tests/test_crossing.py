@@ -203,7 +203,7 @@ def test_logs_tell_whom_they_cost(logs):
 
 def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypatch):
     """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
-    monkeypatch.setattr(sys.modules["ringfence.evaluation.rollout"], "CHUNK", 2)
+    monkeypatch.setattr(sys.modules["ringfence.evaluation.protocol"], "CHUNK", 2)
     run = loop.train("bc", logs, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card.data.episodes == 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
+from ringfence.evaluation.replay_scene import motion_of, names_of, windows_of
 from ringfence.guards.shown import _going
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints

@@ -13,7 +13,7 @@ import pytest
 from ringfence.cli.app import main
 from ringfence.deploy import zoo
 from ringfence.deploy.controller import Controller
-from ringfence.deploy.evidence import Evidence
+from ringfence.deploy.watch import Evidence
 from ringfence.envs import Crossing
 from ringfence.errors import NoSafeAction, UserError
 from ringfence.evaluation.certificate import digest

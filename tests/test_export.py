@@ -19,7 +19,7 @@ import pytest
 from ringfence.cli.app import main
 from ringfence.deploy import export as exporting
 from ringfence.deploy.controller import Controller
-from ringfence.deploy.step import Entry, Step
+from ringfence.deploy.export import Entry, Step
 from ringfence.errors import NoSafeAction, UserError
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore

@@ -13,8 +13,7 @@ import pytest
 
 from ringfence import algos
 from ringfence.algos import drivers, flow
-from ringfence.deploy.export import metadata_of
-from ringfence.deploy.step import Step
+from ringfence.deploy.export import Step, metadata_of
 from ringfence.errors import UserError
 from ringfence.evaluation.certificate import digest
 from ringfence.loading.resolve import load, resolve

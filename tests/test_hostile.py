@@ -37,8 +37,7 @@ from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation, SpeedLimit
 from ringfence.report import board
-from ringfence.report.pooling import normal_return
-from ringfence.report.table import sections
+from ringfence.report.table import normal_return, sections
 from ringfence.training.runs import Run
 from tests import corpus, strange, strange_files
 from tests.corpus import TASK

@@ -8,8 +8,7 @@ from ringfence.cli import app
 from ringfence.datasets.audit import audit
 from ringfence.errors import StoreError, UserError
 from ringfence.evaluation.compensation import compensated
-from ringfence.evaluation.ope import estimate
-from ringfence.evaluation.replay.judge import check_view
+from ringfence.evaluation.replay import check_view
 from ringfence.faults import Faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
@@ -155,8 +154,8 @@ def test_evaluation_by_undelayed_logs_alone_acts_at_once(world, tmp_path, monkey
     store = ringfence.undelay(carts(steps=STEPS + 2), 2)  # the World's own
     run = ringfence.train("bc", store, out=tmp_path, changes={"num_updates": 2, "width": 8}, quiet=True)[0]
     asked = []
-    monkeypatch.setattr(estimate, "resolve", lambda spec: asked.append(spec) or resolve(spec))
-    monkeypatch.setattr(estimate, "_refuse_without_state", lambda *_: 1 / 0)
+    monkeypatch.setattr("ringfence.evaluation.ope.resolve", lambda spec: asked.append(spec) or resolve(spec))
+    monkeypatch.setattr("ringfence.training.worlds.fit", lambda *_, **__: 1 / 0)
     for options in ({}, {"delay": 2}):
         with pytest.raises(ZeroDivisionError):
             ringfence.ope(run, store, guard="shield", world=world, anyway=True, **options)

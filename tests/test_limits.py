@@ -13,7 +13,7 @@ from ringfence.algos import td3bc
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.report import build_report
-from ringfence.report.pooling import pool
+from ringfence.report.table import pool
 from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
 from tests.test_report import CONSTANTS, folder, result

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.evaluation.replay.scene import names_of
+from ringfence.evaluation.replay_scene import names_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import features
 from ringfence.problem.partners import others as others_of

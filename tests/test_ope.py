@@ -12,8 +12,8 @@ import pytest
 import ringfence
 from ringfence.cli import app
 from ringfence.errors import UserError
-from ringfence.evaluation.ope.fqe import FQE, fitted_q
-from ringfence.evaluation.ope.logs import Logs
+from ringfence.evaluation.ope import FQE, fitted_q
+from ringfence.evaluation.ope_responses import Logs
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.training import loop, worlds
@@ -152,7 +152,7 @@ def test_a_policy_is_played_as_long_as_the_logs(uneven):
 
 def test_episodes_that_were_trained_on_are_counted(uneven):
     """Half of its own training logs counted as new."""
-    from ringfence.evaluation.ope.estimate import _trained_on
+    from ringfence.evaluation.ope import _trained_on
 
     store, run, world = uneven
     new = dataclasses.replace(store, observations=store.observations + 1)
@@ -212,7 +212,7 @@ def renamed_agents(names, **card) -> EpisodeStore:
 
 def test_an_estimate_that_diverges_is_not_told():
     """A cost of −2971 was printed."""
-    from ringfence.evaluation.ope.fqe import _bounded
+    from ringfence.evaluation.ope import _bounded
 
     always = np.array([0.0, 20.0])
     assert not _bounded(np.full(5, -2971.0), always).known and not _bounded(np.array([np.nan, 1.0]), always).known

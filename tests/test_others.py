@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ringfence.errors import UserError
-from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
+from ringfence.evaluation.replay_scene import motion_of, names_of, windows_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import FeatureMap, from_data, from_dict, to_dict
 from ringfence.problem.partners import others

@@ -12,7 +12,7 @@ from ringfence import Controller
 from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
 from ringfence.evaluation import ope
-from ringfence.evaluation.replay.judge import check_view
+from ringfence.evaluation.replay import check_view
 from ringfence.loading.resolve import load, load_job
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds

@@ -20,11 +20,9 @@ from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
 from ringfence.evaluation import stress
 from ringfence.evaluation.certificate import Certificate
-from ringfence.evaluation.certify import certify
-from ringfence.evaluation.own_trials import Foresight
-from ringfence.evaluation.play import play_all, simulators_of
+from ringfence.evaluation.certify import Foresight, certify
+from ringfence.evaluation.play import play_all, simulator, simulators_of
 from ringfence.evaluation.player import player_of_run, shape_of
-from ringfence.evaluation.simulators import simulator
 from ringfence.faults import Faults
 from ringfence.loading import resolve
 from ringfence.loading.spec import PolicySpec

@@ -11,22 +11,19 @@ import ringfence
 from ringfence.cli import app
 from ringfence.deploy.controller import Controller
 from ringfence.errors import UserError
+from ringfence.evaluation import replay
 from ringfence.evaluation.certificate import Certificate
-from ringfence.evaluation.certify import certify
-from ringfence.evaluation.replay import judge
-from ringfence.evaluation.replay.judge import Body, Played, check_view, radius_of, rows_of
-from ringfence.evaluation.replay.motion import kinematics_of
-from ringfence.evaluation.replay.result import Film
-from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
-from ringfence.evaluation.replay.stage import Stage
-from ringfence.evaluation.replay.trials import Windowed
+from ringfence.evaluation.certify import Windowed, certify
+from ringfence.evaluation.replay import Body, Film, Played, check_view, radius_of, rows_of
+from ringfence.evaluation.replay_scene import motion_of, names_of, windows_of
+from ringfence.evaluation.replay_stage import Stage, kinematics_of
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.entries import Names
-from ringfence.report import replay_page
+from ringfence.report import logs_pages
 from ringfence.world import save
 from ringfence.world.card import Verdict
 from ringfence.world.causes import Cause, Edge, Found
@@ -79,7 +76,7 @@ def close():
 @pytest.fixture(autouse=True)
 def shortsighted(monkeypatch):
     """The formula's guard looks five rows ahead, not twenty, which take long to compile."""
-    monkeypatch.setattr(judge, "LONG", 5 * DT)
+    monkeypatch.setattr(replay, "LONG", 5 * DT)
 
 
 def test_who_drives_blindly_touches_and_a_guard_prevents_or_causes():
@@ -127,7 +124,7 @@ def test_who_flies_is_replayed_in_space(tmp_path):
         ringfence.replay(None, flyers(), radius=RADIUS, guard="none", kinematics="bicycle")
     place = stage.play("seek").place[0]
     film = Film("seek", others=w.others_at[0], logged=w.place[0], alone=place, guarded=place)
-    assert "<svg" in replay_page._drawn(film, RADIUS, 0)
+    assert "<svg" in logs_pages._drawn(film, RADIUS, 0)
 
 
 def test_driven_agents_observe_what_they_would():
@@ -196,9 +193,9 @@ def test_the_radius_is_that_of_the_worlds_cause_where_costs_tell_no_distance():
 
 def test_replays_show_their_progress_unless_they_are_quiet(capsys):
     stage = stage_of(walkers())
-    quiet = judge._played(stage, {"straight": "straight"}, {}, brake=True)
+    quiet = replay._played(stage, {"straight": "straight"}, {}, brake=True)
     assert capsys.readouterr().err == ""
-    shown = judge._played(stage, {"straight": "straight"}, {}, brake=True, quiet=False)
+    shown = replay._played(stage, {"straight": "straight"}, {}, brake=True, quiet=False)
     said = capsys.readouterr().err
     assert f"straight, no guard (1 of 2): {STEPS}/{STEPS}" in said and "straight, brake (2 of 2)" in said
     np.testing.assert_array_equal(shown[0].plain.contact, quiet[0].plain.contact)
@@ -340,7 +337,7 @@ def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned,
 def test_windows_are_halved_by_the_order_of_logs_and_what_was_foreseen_is_compared_with_what_came(close, cloned):
     store, world = close
     body = Body(radius=0.1, steps=20, every_episode=True)
-    windowed = Windowed.of(store, cloned, world, body, Faults(), 100, 100, 1, True)
+    windowed = Windowed.of(store, cloned, world, body, Faults(), {"calibration": 100, "test": 100}, 1, True)
     first, second = (set(zip(w.episode, w.start)) for w in (windowed.calibration.windows, windowed.test.windows))
     assert first and max(first) < min(second)
     guard = build(Nothing(), world, None, "shield", "learned", margin=-50.0, **SMALL)
@@ -355,8 +352,8 @@ def test_windows_are_halved_by_the_order_of_logs_and_what_was_foreseen_is_compar
 def test_a_replayed_guard_that_knows_of_faults_has_the_options_for_them(close, cloned, monkeypatch):
     store, world = close
     guards = []
-    monkeypatch.setattr(judge, "_played", lambda stage, players, filters, *_: guards.append(filters["shield"]) or [])
-    monkeypatch.setattr(judge, "rows_of", lambda *_: [])
+    monkeypatch.setattr(replay, "_played", lambda stage, players, filters, *_: guards.append(filters["shield"]) or [])
+    monkeypatch.setattr(replay, "rows_of", lambda *_: [])
     for run in (None, cloned):
         given = {"world": world, "radius": 0.1, "baselines": False, "anyway": True, "every_episode": True}
         result = ringfence.replay(run, store, faults={"delay": 1, "drop": 0.2}, compensate=True, **given)
@@ -372,8 +369,8 @@ def test_a_driven_agent_of_undelayed_logs_acts_as_late_as_they_did_and_its_guard
     late = dataclasses.replace(store, card=store.card.updated(action_delay=1))
     knows = dataclasses.replace(world, card=replace(world.card, data=replace(world.card.data, action_delay=1)))
     seen = []
-    monkeypatch.setattr(judge, "_played", lambda stage, _, filters, *__: seen.append((stage, filters["shield"])) or [])
-    monkeypatch.setattr(judge, "rows_of", lambda *_: [])
+    monkeypatch.setattr(replay, "_played", lambda stage, _, filters, *__: seen.append((stage, filters["shield"])) or [])
+    monkeypatch.setattr(replay, "rows_of", lambda *_: [])
     given = {"world": knows, "radius": 0.1, "baselines": False, "anyway": True, "every_episode": True}
     result = ringfence.replay(None, late, **given)
     assert "take effect 1 step late, as whoever was logged" in result.notes[0]

@@ -14,7 +14,7 @@ import pytest
 from ringfence.algos import ICBF
 from ringfence.errors import UserError
 from ringfence.evaluation import statistics
-from ringfence.report import build_report, player, provenance
+from ringfence.report import build_report, page, provenance
 from ringfence.report.table import sections
 from ringfence.training.runs import Run
 
@@ -327,7 +327,7 @@ def test_runs_without_results_are_refused(tmp_path):
 
 def test_players_keep_the_chosen_plan_first(runs):
     (section,) = sections(runs)
-    many, one = player.players(section)
+    many, one = page.players(section)
     assert (many["label"], one["label"]) == ("ICBF-Diffuser split+sampling_steps4", "ICBF-Diffuser split")
     kept = np.load(runs[0].path / "rollout-split+sampling_steps4.npz")
     shown = np.array(many["episodes"][1]["plans"]) / 1000
@@ -340,8 +340,8 @@ def test_players_keep_the_chosen_plan_first(runs):
 
 def test_many_plans_are_cut_to_the_budget(monkeypatch):
     plans = np.arange(2 * 6 * 3 * 2 * 2, dtype=float).reshape(2, 6, 3, 2, 2) / 1000
-    monkeypatch.setattr(player, "NUMBERS", 2 * 3 * 2 * 2 * 2)
-    shown = np.array(player.few(plans, np.array([5, 0])))
+    monkeypatch.setattr(page, "NUMBERS", 2 * 3 * 2 * 2 * 2)
+    shown = np.array(page.few(plans, np.array([5, 0])))
     assert shown.shape == (2, 2, 3, 2, 2) and np.allclose(shown[0, 0] / 1000, plans[0, 5])
 
 
@@ -349,7 +349,7 @@ def test_a_plan_is_repeated_while_it_is_followed():
     plans = np.zeros((1, 3, 1, 2, 1, 4))
     plans[0, 0, ..., 2] = 0.5
     plans[0, 2, ..., 2] = 0.7
-    xy = player.tracks({"plans": plans}, NAMES, 1, 0)
+    xy = page.tracks({"plans": plans}, NAMES, 1, 0)
     assert np.allclose(xy[0, :, 0, 0, 0, 0], [0.5, 0.5, 0.7])
 
 

@@ -23,7 +23,7 @@ from ringfence.datasets.matd3 import MATD3Config
 from ringfence.datasets.recipes import robots
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
-from ringfence.evaluation import protocol, rollout
+from ringfence.evaluation import protocol
 from ringfence.logs.schema import ARRAYS
 from ringfence.problem import constraints, features
 from ringfence.proposals.base import Constant
@@ -124,17 +124,17 @@ class Wait(Push):
 def test_rollouts_stop_where_the_robot_falls(monkeypatch):
     monkeypatch.setattr(simulator, "HEALTHY_Z", (0.6, 1.0))  # it soon comes to rest below
     env = SafeMuJoCo("4x2", episode_length=150)
-    played = rollout.rollout(Push(), env, 6)
+    played = protocol.rollout(Push(), env, 6)
     assert played["rewards"].shape == played["costs"].shape == (6, 150)
     assert played["states"].shape == (6, 151, len(env.state_names))
-    again = rollout.rollout(Push(), env, 3)
+    again = protocol.rollout(Push(), env, 3)
     np.testing.assert_array_equal(again["rewards"], played["rewards"][:3])  # a reset is the same in any batch
-    other = rollout.rollout(Push(), env, 3, split="validation")
+    other = protocol.rollout(Push(), env, 3, split="validation")
     assert not np.array_equal(other["states"][:, 0], played["states"][:3, 0])
     ends = [int(np.flatnonzero(r)[-1]) + 1 for r in played["rewards"]]
     assert max(ends) < 150 and len(set(ends)) > 1
     assert played["steps"].tolist() == ends and played["terminated"].all()
-    foreseen = rollout.rollout(Foresees(), env, 6, foreseen=True)["next_clearance"]
+    foreseen = protocol.rollout(Foresees(), env, 6, foreseen=True)["next_clearance"]
     np.testing.assert_array_equal(foreseen, np.where(np.arange(150) < played["steps"][:, None], 0.5, -np.inf))
     told = protocol.summarise(played, registry.get("ant_4x2-good"), np.zeros(6, bool))
     assert told["termination_rate"] == 1 and told["steps_mean"] == np.mean(ends)
@@ -144,7 +144,7 @@ def test_rollouts_stop_where_the_robot_falls(monkeypatch):
         assert (rewards[end:] == 0).all() and (states[end:] == states[end]).all()
     task = registry.get("halfcheetah_2x3-poor")
     idle = Constant(task.spec(task.feature_map("pruned")))
-    cheetah = rollout.rollout(idle, replace(task.env, episode_length=5), 2)
+    cheetah = protocol.rollout(idle, replace(task.env, episode_length=5), 2)
     assert cheetah["steps"].tolist() == [5, 5] and not cheetah["terminated"].any()
 
 
@@ -302,7 +302,7 @@ def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):
     from PIL import Image
 
     env = SafeMuJoCo("2x4", episode_length=10)
-    played = rollout.rollout(Wait(), env, 1)
+    played = protocol.rollout(Wait(), env, 1)
     states, costs = played["states"][0], played["costs"][0]
     fallen = np.concatenate([states, np.repeat(states[-1:], 30, 0)])  # the film ends there
     try:

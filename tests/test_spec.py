@@ -7,7 +7,7 @@ import pytest
 import tyro
 
 from ringfence.bench.suites import SUITES
-from ringfence.cli.playing import Playing
+from ringfence.cli.shared import Playing
 from ringfence.errors import UserError
 from ringfence.loading.spec import PolicySpec
 

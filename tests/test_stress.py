@@ -19,17 +19,16 @@ import ringfence
 from ringfence.cli.app import main
 from ringfence.deploy import zoo
 from ringfence.deploy.controller import Controller
-from ringfence.deploy.stamps import Stamps
+from ringfence.deploy.watch import Stamps
 from ringfence.envs import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.pettingzoo import CrossingParallel
 from ringfence.errors import NoSafeAction, UserError
-from ringfence.evaluation.certificate import Certificate, digest
+from ringfence.evaluation.certificate import Certificate, Monitor, digest
 from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.compensation import compensated, compensation, own_acceleration
 from ringfence.evaluation.evaluate import evaluate
-from ringfence.evaluation.monitor import Monitor
-from ringfence.evaluation.rollout import rollout
+from ringfence.evaluation.protocol import rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import FILE
 from ringfence.faults import Faults
@@ -407,7 +406,7 @@ def test_faults_are_called_so_in_the_help(capsys):
 
 @pytest.fixture
 def few(monkeypatch):
-    monkeypatch.setattr("ringfence.evaluation.rollout.CHUNK", 4)
+    monkeypatch.setattr("ringfence.evaluation.protocol.CHUNK", 4)
 
 
 def test_a_quantile_of_few_episodes_is_none():

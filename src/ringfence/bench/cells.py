@@ -403,31 +403,33 @@ class _Group:
         while self.left:
             self._start()
             try:
-                self._train()
+                # All that is left, in one call: seeds share their data and compiled programs.
+                first = self.left[0]
+                store = data_of(first.task, first.transitions)
+                for cell in self.left:
+                    if paired := adopt(cell, self.out, store.card.to_dict()):
+                        self.adopted[cell] = str(paired.folder(self.out).relative_to(self.out))
+                loop.train(
+                    first.algorithm,
+                    store,
+                    preset=first.preset,
+                    seeds=tuple(cell.seed for cell in self.left),
+                    changes=dict(first.changes),
+                    folder={cell.seed: cell.folder(self.out) for cell in self.left}.__getitem__,
+                    on_finish=self._finish,
+                    quiet=True,
+                )
             except Exception as error:
-                self._fail(error)
+                failed = self.left[0]
+                if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
+                    failed = next(c for c in self.left if c.folder(self.out) == error.folder)
+                record_failure(failed, self.out, f"{type(error).__name__}: {error}", traceback.format_exc())
+                self.left.remove(failed)
+                self.tell("failed", failed)
 
     def _start(self) -> None:
         self.begun = time.perf_counter()
         self.tell("start", self.left[0])
-
-    def _train(self) -> None:
-        """All that is left, in one call: seeds share their data and compiled programs."""
-        first = self.left[0]
-        store = data_of(first.task, first.transitions)
-        for cell in self.left:
-            if paired := adopt(cell, self.out, store.card.to_dict()):
-                self.adopted[cell] = str(paired.folder(self.out).relative_to(self.out))
-        loop.train(
-            first.algorithm,
-            store,
-            preset=first.preset,
-            seeds=tuple(cell.seed for cell in self.left),
-            changes=dict(first.changes),
-            folder={cell.seed: cell.folder(self.out) for cell in self.left}.__getitem__,
-            on_finish=self._finish,
-            quiet=True,
-        )
 
     def _finish(self, run: Run) -> None:
         """Play the cell whose run is trained, and go on to the next one."""
@@ -441,28 +443,17 @@ class _Group:
         for trial in cell.missing_trials(self.out, self.episodes):
             worlds.with_world(trial.play, run, self.episodes)
         played = time.perf_counter() - self.begun - trained
-        _record(cell, self.out, "done", self._took(cell, trained, played))
-        self.tell("done", self.left.pop(0))
-        if self.left:
-            self._start()
-
-    def _took(self, cell: Cell, trained: float, played: float) -> dict[str, Any]:
-        """What the cell's status says of its time; of one that was only played again, training took what it took."""
+        # What the cell's status says of its time; of one that was only played again, training took what it took.
         adopted = {"adopted": self.adopted[cell]} if cell in self.adopted else {}
         took: dict[str, Any] = {"train_seconds": trained, "eval_seconds": played, **adopted}
         before = dict(cell.status(self.out))
         if before.get("state") == "done":
             took |= {name: before[name] for name in ("train_seconds", "adopted") if name in before}
             took["eval_seconds"] += before.get("eval_seconds", 0.0)
-        return took
-
-    def _fail(self, error: Exception) -> None:
-        cell = self.left[0]
-        if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
-            cell = next(c for c in self.left if c.folder(self.out) == error.folder)
-        record_failure(cell, self.out, f"{type(error).__name__}: {error}", traceback.format_exc())
-        self.left.remove(cell)
-        self.tell("failed", cell)
+        _record(cell, self.out, "done", took)
+        self.tell("done", self.left.pop(0))
+        if self.left:
+            self._start()
 
 
 @functools.lru_cache(maxsize=1)

@@ -114,15 +114,12 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
             wanted = [preset + ending for ending in endings for preset in presets]
             variant = next((v for v in wanted if (task, algorithm, v) in found), "")
             runs = found.get((task, algorithm, variant), [])
-            ours = _summary(runs) if runs else None
+            ours = None
+            if runs:
+                reward, cost = (np.array([run[name] for run in runs]) for name in ("return_norm", "cost_norm"))
+                ours = float(reward.mean()), _deviation(reward), float(cost.mean()), _deviation(cost)
             table.append(Line(task, method, printed, ours, variant, len(runs)))
     return table
-
-
-def _summary(runs: list[Result]) -> tuple[float, float | None, float, float | None]:
-    reward = np.array([r["return_norm"] for r in runs])
-    cost = np.array([r["cost_norm"] for r in runs])
-    return float(reward.mean()), _deviation(reward), float(cost.mean()), _deviation(cost)
 
 
 def _deviation(x: np.ndarray) -> float | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,17 +57,8 @@ class Trial(NamedTuple):
 
 def rows(out: str | Path, certificate: Certificate | None = None) -> list[Row]:
     """Every evaluation behind faults in a results folder; none where its suite has none."""
-    found = list(_rows(Path(out), certificate))
-    if certificate is not None and not any(row[COVERS] for row in found):
-        raise UserError(
-            f"This certificate is of no guard that was played in '{out}'; make one of a run there by "
-            "`ringfence certify`."
-        )
-    return found
-
-
-def _rows(out: Path, certificate: Certificate | None) -> Iterator[Row]:
-    for file in sorted((out / "cells").glob(f"*/*/[!.]*/{stress.FILE}")):
+    found = []
+    for file in sorted((Path(out) / "cells").glob(f"*/*/[!.]*/{stress.FILE}")):
         run = Run(file.parent)
         seed = run.config["seed"]
         for result in stress.results(run).values():
@@ -79,7 +69,13 @@ def _rows(out: Path, certificate: Certificate | None) -> Iterator[Row]:
             row["run"] = str(file.parent.relative_to(out))
             if certificate is not None:
                 row[COVERS] = covers(certificate, result)
-            yield row
+            found.append(row)
+    if certificate is not None and not any(row[COVERS] for row in found):
+        raise UserError(
+            f"This certificate is of no guard that was played in '{out}'; make one of a run there by "
+            "`ringfence certify`."
+        )
+    return found
 
 
 def covers(certificate: Certificate, result: Row) -> str:

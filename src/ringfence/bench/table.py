@@ -6,7 +6,6 @@ Ranks, intervals and comparisons are made by `report/board.py` and its neighbour
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,7 +79,15 @@ def rows(out: str | Path) -> list[dict[str, Any]]:
     found = read(out)
     if all(row.run is None for row in found):
         raise UserError(f"'{out}' holds no finished cell yet; run `ringfence bench`.")
-    _check_once(row for row in found if row.run is not None)
+    seen: dict[tuple[str, str, str, int], Row] = {}
+    for one in (row for row in found if row.run is not None):
+        key = (one.task, one.algorithm, one.variant, one.seed)
+        other = seen.setdefault(key, one)
+        if other is not one:
+            raise UserError(
+                f"'{one.file.parent}' and '{other.file.parent}' are both {' '.join(map(str, key[:3]))} seed {key[3]}, "
+                "with other settings; delete the one that is not meant."
+            )
     return [_flat(row, out) for row in found]
 
 
@@ -88,18 +95,6 @@ def _flat(row: Row, out: Path) -> dict[str, Any]:
     of_row = {"algorithm": row.algorithm, "variant": row.variant, "seed": row.seed}
     place = row.file if row.run is None else row.run.path
     return {**UNGUARDED, **row.result, **of_row, "run": str(place.relative_to(out))}
-
-
-def _check_once(rows: Iterable[Row]) -> None:
-    seen: dict[tuple[str, str, str, int], Row] = {}
-    for row in rows:
-        key = (row.task, row.algorithm, row.variant, row.seed)
-        other = seen.setdefault(key, row)
-        if other is not row:
-            raise UserError(
-                f"'{row.file.parent}' and '{other.file.parent}' are both {' '.join(map(str, key[:3]))} seed {key[3]}, "
-                "with other settings; delete the one that is not meant."
-            )
 
 
 def write_csv(out: str | Path) -> Path:

@@ -16,12 +16,23 @@ from rich.text import Text
 from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
-from ringfence.cli.console import Refusals, complain, console, plain_warnings
-from ringfence.cli.doctor import doctor
-from ringfence.cli.faults import NO_FAULTS, Wrong
-from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
-from ringfence.cli.replaying import AS_LOGGED, Replayed
-from ringfence.errors import Interrupted, UserError, whole_number
+from ringfence.cli.first import demonstrate, doctor
+from ringfence.cli.shared import (
+    AS_IT_IS,
+    AS_LOGGED,
+    NO_FAULTS,
+    Assignments,
+    How,
+    Playing,
+    Refusals,
+    Replayed,
+    Wrong,
+    assignments,
+    complain,
+    console,
+    plain_warnings,
+)
+from ringfence.errors import Interrupted, UserError, one_of, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.files import writable
 from ringfence.utils.text import lines, terminal
@@ -81,11 +92,16 @@ def train(
         vmap_seeds: train all seeds in one program.
         tensorboard: write TensorBoard logs, too.
     """
+    from ringfence import algos
     from ringfence.training import loop
 
     changes = assignments(set)
     whole_number("seeds", seeds, 1, 10_000)
-    _early(algorithm, preset, changes)
+    # Refuse bad names before a data set is made for them.
+    chosen = algos.get(algorithm)
+    named = preset or chosen.preset_for(())
+    one_of(f"preset of {chosen.name}", named, chosen.presets)
+    algos.configured(chosen, named, changes)
     runs = loop.train(
         algorithm,
         _store(data),
@@ -150,7 +166,7 @@ def fit(
         print(world.save(made, out_file))
     if report is not None and store is not None:
         from ringfence.datasets.audit import audit
-        from ringfence.report.ope_page import build_ope
+        from ringfence.report.logs_pages import build_ope
 
         print(build_ope(report, made.card, audit(store)))
     if made.card.verdict is not None and made.card.verdict.word == "unfit":
@@ -188,49 +204,34 @@ def evaluate(
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
         num_recorded = num_recorded or 1
-    given |= {
-        "episodes": episodes,
-        "split": split,
-        "num_recorded": num_recorded,
-        "checkpoint": checkpoint,
-        "quiet": False,
-    }
-    names = (
-        "run",
-        "variant",
-        "return",
-        "cost",
-        "safe starts",
-        "unsafe episodes (95 % ≤)",
-        "return norm",
-        "cost norm",
-    )
+    given |= {"episodes": episodes, "split": split, "num_recorded": num_recorded, "checkpoint": checkpoint}
+    names = ("run", "variant", "return", "cost", "safe starts", "unsafe episodes (95 % ≤)", "return norm", "cost norm")
     table = Table(*names, "ended early")
     doubts: list[str] = []
     refusals = Refusals()
     for run in found:
         with refusals.of(run):
-            result = with_world(run_evaluation, run, **given)
+            result = with_world(run_evaluation, run, quiet=False, **given)
             table.add_row(*_evaluated(run, result))
-            doubts += _doubt(result)
+            share = result.get("infeasible_rate", 0.0)
+            if share > OFTEN:  # it has no column
+                doubts.append(
+                    f"{result['variant']}: in {100 * share:.2g} % of the steps the guard found no action that keeps "
+                    "its margin; it took the best one that it found, which may be unsafe."
+                )
             if video:
-                print(_film(run, result["variant"]))
+                from ringfence.report.video import film
+
+                print(film(run, result["variant"]))
     _say(table, refusals, len(found), doubts)
-
-
-def _doubt(result: dict[str, Any]) -> list[str]:
-    """What a guard could not do, where that was often; it has no column."""
-    share = result.get("infeasible_rate", 0.0)
-    if not share > OFTEN:
-        return []
-    return [
-        f"{result['variant']}: in {100 * share:.2g} % of the steps the guard found no action that keeps its margin; it "
-        "took the best one that it found, which may be unsafe."
-    ]
 
 
 def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
     """A result's row of the table."""
+    from ringfence.datasets.registry import TASKS
+
+    task = TASKS.get(result["task"])
+    usual_size = task is None or result["agents"] == task.simulator.n_agents
     return [
         terminal(run.path),
         terminal(result["variant"]),
@@ -239,24 +240,10 @@ def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
         f"{result['cost_safe_start']:.3f}",
         f"{result['violation_rate']:.3f} (≤ {result['violation_upper']:.3f})",
         # Constants are those of the logs' team.
-        f"{result['return_norm']:.3f}" if _of_usual_size(result) else "–",
+        f"{result['return_norm']:.3f}" if usual_size else "–",
         f"{result['cost_norm']:.3f}",
         f"{100 * result['termination_rate']:.0f} %",
     ]
-
-
-def _film(run: Run, variant: str) -> Path:
-    from ringfence.report.video import film
-
-    return film(run, variant)
-
-
-def _of_usual_size(result: dict[str, Any]) -> bool:
-    """Whether as many agents played as a task's constants are of."""
-    from ringfence.datasets.registry import TASKS
-
-    task = TASKS.get(result["task"])
-    return task is None or result["agents"] == task.simulator.n_agents
 
 
 def play(
@@ -283,23 +270,15 @@ def play(
         compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.play import play as run_play
-    from ringfence.evaluation.simulators import simulator
+    from ringfence.evaluation.play import simulator
     from ringfence.training.worlds import with_world
 
     given = playing.arguments()
     faults = wrong.faults()
     found = _some_runs(runs)
     make = simulator(env)
-    given |= {
-        "episodes": episodes,
-        "split": split,
-        "num_envs": num_envs,
-        "early_ends": early_ends,
-        "faults": faults,
-        "compensate": compensate,
-        "keep": not faults.given,
-        "quiet": False,
-    }
+    given |= {"episodes": episodes, "split": split, "num_envs": num_envs, "early_ends": early_ends}
+    given |= {"faults": faults, "compensate": compensate, "keep": not faults.given, "quiet": False}
     table = Table("run", "guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
     refusals = Refusals()
     for run in found:
@@ -364,21 +343,15 @@ def stress(
             good for.
         env: what makes a simulator of your own, as FILE.py:NAME or MODULE:NAME. It is run.
     """
-    from ringfence.evaluation.simulators import simulator
+    from ringfence.evaluation.play import simulator
     from ringfence.evaluation.stress import stress as run_stress
     from ringfence.training.worlds import with_world
 
     faults = wrong.faults()
     given = playing.arguments()
     found = _some_runs(runs)
-    given |= {
-        "episodes": episodes,
-        "split": split,
-        "checkpoint": checkpoint,
-        "compensate": compensate,
-        "make_env": None if env is None else simulator(env),
-        "quiet": False,
-    }
+    given |= {"episodes": episodes, "split": split, "checkpoint": checkpoint, "compensate": compensate}
+    given |= {"make_env": None if env is None else simulator(env), "quiet": False}
     names = ("guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
     table = Table("run", Column("faults", no_wrap=True), *names)
     refusals = Refusals()
@@ -420,7 +393,7 @@ def certify(
         logs: a store of its task, which is replayed: its first half calibrates the margin, its second gives the bound.
     """
     from ringfence.evaluation.certify import certify as run_certify
-    from ringfence.evaluation.simulators import simulator
+    from ringfence.evaluation.play import simulator
     from ringfence.training.worlds import with_world
 
     faults = wrong.faults()
@@ -516,7 +489,7 @@ def ope(
     from ringfence.datasets.audit import audit
     from ringfence.evaluation import ope as evaluation
     from ringfence.loading.spec import PolicySpec
-    from ringfence.report.ope_page import build_ope
+    from ringfence.report.logs_pages import build_ope
     from ringfence.training import worlds
 
     given = playing.arguments()
@@ -559,7 +532,7 @@ def replay(
         compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.replay import replay as replayed
-    from ringfence.report.replay_page import build_replay
+    from ringfence.report.logs_pages import build_replay
     from ringfence.training.runs import write_json
     from ringfence.training.worlds import with_world
 
@@ -608,9 +581,7 @@ def demo(
         tier: expert, medium, medium-replay or random.
         quick: a smoke test of a minute or two, with numbers that mean nothing.
     """
-    from ringfence.cli.demo import run
-
-    run(out_dir, tier, quick)
+    demonstrate(out_dir, tier, quick)
 
 
 COMMANDS = {
@@ -692,17 +663,6 @@ def _group_of(arguments: list[str]) -> tuple[list[str], dict[str, Any], str]:
             return [name], commands, description
     helps = {"data": lambda: main(["data", "--help"]), "log": lambda: main(["log", "--help"])}
     return [], COMMANDS | helps, "Safe offline multi-agent reinforcement learning."
-
-
-def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:
-    """Refuse bad names before a data set is made for them."""
-    from ringfence import algos
-    from ringfence.errors import one_of
-
-    a = algos.get(algorithm)
-    preset = preset or a.preset_for(())
-    one_of(f"preset of {a.name}", preset, a.presets)
-    algos.configured(a, preset, changes)
 
 
 def _store(data: str) -> EpisodeStore:

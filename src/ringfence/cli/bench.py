@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
-from ringfence.cli.console import complain, console
+from ringfence.cli.shared import complain, console
 from ringfence.errors import UserError, one_of
 from ringfence.utils.text import terminal
 
@@ -47,7 +47,7 @@ class Machines:
             for name, value in (("workers", self.workers), ("memory", self.memory)):
                 if value is not None:
                     raise UserError(f"--{name} is about local processes, Ray divides its cluster itself; leave it out.")
-            from ringfence.bench.cluster import run_ray
+            from ringfence.bench.engines import run_ray
 
             return run_ray(grid, address=self.address, threads=self.threads)
         from ringfence.bench import run_local

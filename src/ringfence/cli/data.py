@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.markup import escape
 
-from ringfence.cli.console import console
+from ringfence.cli.shared import console
 from ringfence.errors import UserError, plain
 from ringfence.logs.io.table_options import Columns, EpisodeRules, Written
 from ringfence.utils.files import writable

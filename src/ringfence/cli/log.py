@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from ringfence.cli.console import console
+from ringfence.cli.shared import console
 from ringfence.errors import whole_number
 from ringfence.utils.text import lines
 
@@ -56,7 +56,13 @@ def show(file: Positional[Path], first: int = 0, number: int = 20) -> None:
             schemas.check(record, schemas.RECORDS.get(record["kind"], schemas.Event))
         except ValueError as error:
             raise LogError(f"'{file}': record {record['n']} is none of a controller ({error}).", record["n"]) from None
-        _count(counts, record)
+        counts["records"] += 1
+        kind = record["kind"]
+        if kind in ("step", "refused"):
+            counts["steps" if kind == "step" else "refusals"] += 1
+        counts["steps with a correction"] += bool(record.get("corrected"))
+        for flag in ("covered", "proved"):
+            counts[f"not {flag}"] += record.get(flag) is False
         if first <= record["n"] < first + number:
             for line in in_words(record):
                 out.print(lines(line), soft_wrap=True)
@@ -88,16 +94,6 @@ def in_words(record: dict[str, Any]) -> list[str]:
             f"{score} margins in row {one['row']}"
         )
     return found
-
-
-def _count(counts: Counter[str], record: dict[str, Any]) -> None:
-    counts["records"] += 1
-    kind = record["kind"]
-    if kind in ("step", "refused"):
-        counts["steps" if kind == "step" else "refusals"] += 1
-    counts["steps with a correction"] += bool(record.get("corrected"))
-    for name in ("covered", "proved"):
-        counts[f"not {name}"] += record.get(name) is False
 
 
 COMMANDS = {"verify": verify, "show": show}

@@ -13,9 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.deploy.evidence import Evidence, explaining
-from ringfence.deploy.stamps import Stamps
-from ringfence.deploy.watch import Fallback, Watch, widened
+from ringfence.deploy.watch import Evidence, Fallback, Stamps, Watch, explaining, widened
 from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.evaluation.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
@@ -183,7 +181,12 @@ class Controller:
                 refuse_other_order(agents, self.agents)
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
-            age = self._age(age, observed_at)
+            if observed_at is not None:
+                if age is not None:
+                    raise UserError("age and observed_at both say how old observations are; give one of them.")
+                guarded = guarded_of(self.policy)
+                dt = None if guarded is None else guarded.guard.world.map.dt
+                age = self._stamps.ages(observed_at, source.agents, dt)
             before = self._carry if age is None else self._aged(age)
             key, now = jax.random.split(self._key)
             carry, step = source.act(before, seen, paid, now)
@@ -200,16 +203,6 @@ class Controller:
         if observed_at is not None:
             self._stamps.acted()
         return action
-
-    def _age(self, age: Any, observed_at: Any) -> Any:
-        """How many steps old observations are, as it was given or by their time."""
-        if observed_at is None:
-            return age
-        if age is not None:
-            raise UserError("age and observed_at both say how old observations are; give one of them.")
-        guarded = guarded_of(self.policy)
-        dt = None if guarded is None else guarded.guard.world.map.dt
-        return self._stamps.ages(observed_at, self._source.agents, dt)
 
     @contextmanager
     def _recorded(self) -> Iterator[None]:
@@ -299,7 +292,10 @@ class _TrainedRun:
             )
         whole = None if state is None else given_as("state", state, (state_width,), origins=origins.state)
         if None in self.job.widths:
-            self._reaches(seen, whole)
+            # Refuse arrays too short for the entries that the run reads.
+            beyond = self.job.feature_map.beyond(seen.shape[-1], None if whole is None else len(whole))
+            if beyond is not None:
+                raise UserError(f"This run reads {beyond}; pass what its data holds.")
         return seen, whole
 
     @in_float32
@@ -307,12 +303,6 @@ class _TrainedRun:
         if cost is not None:
             carry = with_cost(self.policy, carry, cost)
         return self._act(self.policy, carry, *_batch(seen), key)
-
-    def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
-        """Refuse arrays too short for the entries that the run reads."""
-        beyond = self.job.feature_map.beyond(seen.shape[-1], None if state is None else len(state))
-        if beyond is not None:
-            raise UserError(f"This run reads {beyond}; pass what its data holds.")
 
 
 class _Function:

@@ -44,7 +44,6 @@ CALLS = (
     "checkpoint",
     "remat2",
 )
-LOOPS = ("scan", "while", "cond")
 # They hold a program that says how numbers are combined, and JAX takes it along.
 BOUND = ("custom_linear_solve", "reduce", "reduce_window", "select_and_scatter_add")
 CALLBACKS = ("pure_callback", "io_callback")

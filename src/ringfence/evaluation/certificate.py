@@ -2,6 +2,11 @@
 
 A file is believed where it says nothing that its own counts do not say, and its digest is of all of it. A digest is no
 signature: whoever makes a file anew can promise what they like in it.
+
+`Monitor` tests whether the promise is still kept, and may be looked at after every episode. Wealth starts at 1 and bets
+that violations come more often than was promised. While the promise holds it is a supermartingale, so the chance that
+it ever reaches 1/δ is at most δ (Ville 1939), however often one looks. Bets of several sizes are held side by side,
+since nobody knows how much worse things have become.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
+import numpy as np
 from msgspec import Meta
 
 from ringfence.errors import UserError
@@ -29,6 +35,7 @@ from ringfence.utils.pytrees import digest_of, named_arrays
 FORMAT = 2
 LARGEST = 2**20  # bytes of a file; those that are written have some thousand
 CLOSE = 1e-9  # by which a bound may differ from the one that its counts give: libraries round differently
+BETS = 0.5 ** np.arange(1, 7)  # shares of the largest bet, at which one episode without violation would lose all
 
 Level = Annotated[float, Meta(gt=0, lt=1)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -83,6 +90,13 @@ class Certificate:
         again = "the same windows" if self.replayed else "a fresh batch"
         agreed = f"{again} agreed with it" if self.agreed else f"{again} did not agree with it"
         what = "windows" if self.replayed else "episodes"
+        replay = []
+        if self.replayed:
+            replay.append(
+                f"Logs were replayed in windows of {self.replayed['seconds']:.3g} s: one agent is driven "
+                f"({self.replayed['kinematics']}), the others do what they did and do not react, and a violation is to "
+                f"come nearer than {self.replayed['radius']:.3g} m. Windows of one log are no independent draws."
+            )
         return (
             f"With confidence {self.confidence:g} at most {100 * self.bound:.2f} % of {what} violate: "
             f"{self.violations} of {self.episodes} fresh ones did.",
@@ -91,17 +105,8 @@ class Certificate:
             f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batch{'es' * (len(self.rounds) > 1)}; "
             f"{agreed}.",
             f"In {100 * self.held:.1f} % of the fresh {what} no state scored below its prediction by more than that.",
-            *self._replay(),
+            *replay,
             f"It holds for {what} drawn as these were, not for each state, another simulator or an adversary.",
-        )
-
-    def _replay(self) -> tuple[str, ...]:
-        if not self.replayed:
-            return ()
-        return (
-            f"Logs were replayed in windows of {self.replayed['seconds']:.3g} s: one agent is driven "
-            f"({self.replayed['kinematics']}), the others do what they did and do not react, and a violation is to "
-            f"come nearer than {self.replayed['radius']:.3g} m. Windows of one log are no independent draws.",
         )
 
     def save(self, path: str | Path) -> Path:
@@ -130,7 +135,26 @@ class Certificate:
             if stored.pop("digest", None) != _digest_of_words(stored):
                 raise ValueError("it is not what was written: its digest is of other contents")
             found = schemas.check({name: value for name, value in stored.items() if name != "says"}, cls)
-            _check_sense(found)
+            # `ValueError` where it promises what its counts do not tell, or is of a guard that there is not.
+            if found.violations > found.episodes:
+                raise ValueError(f"{found.violations} of {found.episodes} episodes violated")
+            bound = upper_bound(found.violations, found.episodes, found.confidence)
+            if abs(bound - found.bound) > CLOSE:
+                raise ValueError(
+                    f"{found.violations} of {found.episodes} violations are a bound of {bound:.4g} with confidence "
+                    f"{found.confidence:g}, not {found.bound:.4g}"
+                )
+            if found.barrier not in SOURCES:
+                raise ValueError(f"it is of barrier='{found.barrier}', which there is not")
+            for kind, options in ((GuardOptions, found.guard), (Faults, found.faults)):
+                lacking = fields_of(kind).keys() - options.keys()
+                if lacking:
+                    raise ValueError(f"it does not say {sorted(lacking)[0]}")
+                if dataclasses.asdict(build_config(kind, options, "the certificate")) != options:
+                    raise ValueError("its options are of other types")
+            last = found.rounds[-1]
+            if found.guard["margin"] != last["margin"] or found.agreed != (last["quantile"] <= last["margin"]):
+                raise ValueError(f"margin={found.guard['margin']} is not the one that its last batch was played with")
         except (ValueError, OSError) as error:
             raise UserError(
                 f"'{path}' is no certificate ({str(error).rstrip('.')}); make one with `ringfence certify`."
@@ -164,24 +188,33 @@ def _digest_of_words(content: Mapping[str, Any]) -> str:
     return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
-def _check_sense(found: Certificate) -> None:
-    """`ValueError` where it promises what its counts do not tell, or is of a guard that there is not."""
-    if found.violations > found.episodes:
-        raise ValueError(f"{found.violations} of {found.episodes} episodes violated")
-    bound = upper_bound(found.violations, found.episodes, found.confidence)
-    if abs(bound - found.bound) > CLOSE:
-        raise ValueError(
-            f"{found.violations} of {found.episodes} violations are a bound of {bound:.4g} with confidence "
-            f"{found.confidence:g}, not {found.bound:.4g}"
-        )
-    if found.barrier not in SOURCES:
-        raise ValueError(f"it is of barrier='{found.barrier}', which there is not")
-    for kind, options in ((GuardOptions, found.guard), (Faults, found.faults)):
-        lacking = fields_of(kind).keys() - options.keys()
-        if lacking:
-            raise ValueError(f"it does not say {sorted(lacking)[0]}")
-        if dataclasses.asdict(build_config(kind, options, "the certificate")) != options:
-            raise ValueError("its options are of other types")
-    last = found.rounds[-1]
-    if found.guard["margin"] != last["margin"] or found.agreed != (last["quantile"] <= last["margin"]):
-        raise ValueError(f"margin={found.guard['margin']} is not the one that its last batch was played with")
+class Monitor:
+    """Watches episodes against a promised rate of violations.
+
+    monitor = Monitor(rate=0.03)               # the bound of a certificate
+    alarm = monitor.observe(violated=False)    # after every episode
+    """
+
+    def __init__(self, rate: float, false_alarms: float = 0.01):
+        for name, value in (("rate", rate), ("false_alarms", false_alarms)):
+            if not 0 < value < 1:
+                raise UserError(f"{name}={value} must lie between 0 and 1.")
+        self.rate = rate
+        self.false_alarms = false_alarms
+        self.episodes = 0
+        self.alarm = False  # once raised it stays
+        self._log_wealth = np.zeros(len(BETS))
+
+    @property
+    def wealth(self) -> float:
+        """Evidence against the promise; at most `false_alarms` of kept promises ever see it at 1 / `false_alarms`."""
+        return float(np.exp(self._log_wealth).mean())
+
+    def observe(self, violated: bool) -> bool:
+        """Whether the alarm is raised, with this episode."""
+        if not isinstance(violated, bool | np.bool_):
+            raise UserError(f"violated={violated!r} must be true or false; say whether the episode violated.")
+        self._log_wealth += np.log1p(BETS / self.rate * (bool(violated) - self.rate))
+        self.episodes += 1
+        self.alarm = self.alarm or self.wealth >= 1 / self.false_alarms
+        return self.alarm

@@ -14,35 +14,40 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
-from ringfence.envs.base import NativeEnv
-from ringfence.envs.episode import Cost
+from ringfence.envs.base import Moment, NativeEnv
+from ringfence.envs.episode import Cost, Episode
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.certificate import Certificate, Round, digest
 from ringfence.evaluation.compensation import compensated
-from ringfence.evaluation.own_trials import Own
-from ringfence.evaluation.replay.judge import Body
-from ringfence.evaluation.replay.trials import Windowed
-from ringfence.evaluation.rollout import FORESEEN, Played, rollout
+from ringfence.evaluation.play import name_of, play_all, simulators_of
+from ringfence.evaluation.player import player_of_run
+from ringfence.evaluation.protocol import FORESEEN, RESETS, Played, rollout
+from ringfence.evaluation.replay import Body, Logs
+from ringfence.evaluation.replay_stage import Stage
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import check_simulator
-from ringfence.evaluation.trials import Part, Trials, features, least_score, shortfall
 from ringfence.faults import Faults
 from ringfence.faults.policy import under_faults
 from ringfence.guards import Guard
+from ringfence.guards.policy import Guarded
+from ringfence.guards.wrap import Nothing
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.homogeneous import local_features
 from ringfence.training.runs import Run
 from ringfence.types import Array
 from ringfence.utils.compilation import keep_programs
-from ringfence.utils.precision import in_float32
+from ringfence.utils.precision import float32, in_float32
+from ringfence.utils.progress import Progress
+from ringfence.world import World
 
 MAX_ROUNDS = 4  # of calibration
 WIDEST = 6.0  # margin: at more a guard does little but stand
@@ -50,6 +55,10 @@ BOUND_ELSEWHERE = (
     "and certificates need something to play in: a simulator of your own (--env FILE.py:NAME), or logs that are "
     "replayed (--logs)."
 )
+SIDE_BY_SIDE = 16  # simulators of one's own
+EVERY = 10**9  # windows: all that there are
+
+Part = Literal["calibration", "test"]
 
 
 @in_float32
@@ -91,8 +100,9 @@ def certify(
     body = Body(kinematics, wheelbase, radius, steps, every_episode)
     options = {**options, "guard": guard}
     keep_programs()
-    if logs is None:
-        _refuse_unread(body)
+    unread = [f.name for f in dataclasses.fields(body) if getattr(body, f.name) != f.default]
+    if logs is None and unread:
+        raise UserError(f"{unread[0]} is of replays; give logs=, the store that is replayed, or leave it out.")
     if logs is None and make_env is None:
         check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
     if logs is not None and make_env is not None:
@@ -107,22 +117,24 @@ def certify(
     if make_env is not None:
         trials = Own(make_env, faults, counts, cost, quiet)
     elif logs is not None:
-        world = _guard(resolved).world
-        trials = Windowed.of(logs, resolved.run, world, body, faults, calibration, episodes, least, quiet)
+        trials = Windowed.of(logs, resolved.run, _guard(resolved).world, body, faults, counts, least, quiet)
+    resolved, rounds = _calibrated(run, options, resolved, trials, quantile)
+    return _promised(resolved, faults, rounds, confidence, trials.play(resolved, "test", 1), trials.about)
+
+
+def _calibrated(
+    run: Run | str, options: Mapping[str, Any], resolved: Resolved, trials: Simulated | Windowed | Own, quantile: float
+) -> tuple[Resolved, list[Round]]:
+    """The run under the margin that a fresh batch agrees with, or under the last one that was tried."""
     rounds: list[Round] = []
-    agreed = False
-    while len(rounds) < MAX_ROUNDS and not agreed:
+    while True:
         margin = _guard(resolved).options.margin
         played = trials.play(resolved, "calibration", len(rounds))
         found = conformal(played.shortfall, quantile)
         rounds.append({"margin": margin, "quantile": found, "episodes": len(played.violated)})
-        agreed = found <= margin
-        if not agreed and (len(rounds) == MAX_ROUNDS or margin >= WIDEST):
-            break
-        if not agreed:
-            resolved = _resolved(run, {**options, "margin": round(min(found, WIDEST), 3)})
-    tested = trials.play(resolved, "test", 1)
-    return _promised(resolved, faults, rounds, agreed, confidence, tested, trials.about)
+        if found <= margin or len(rounds) == MAX_ROUNDS or margin >= WIDEST:
+            return resolved, rounds
+        resolved = _resolved(run, {**options, "margin": round(min(found, WIDEST), 3)})
 
 
 def conformal(scores: np.ndarray, quantile: float) -> float:
@@ -191,12 +203,6 @@ def _check(confidence: float, quantile: float, calibration: int, episodes: int) 
     return least
 
 
-def _refuse_unread(body: Body) -> None:
-    given = [f.name for f in dataclasses.fields(body) if getattr(body, f.name) != f.default]
-    if given:
-        raise UserError(f"{given[0]} is of replays; give logs=, the store that is replayed, or leave it out.")
-
-
 def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:
     resolved = resolve(PolicySpec.of(run, **options))
     if resolved.guard is None:
@@ -217,7 +223,6 @@ def _promised(
     resolved: Resolved,
     faults: Faults,
     rounds: list[Round],
-    agreed: bool,
     confidence: float,
     tested: Trials,
     about: dict[str, Any],
@@ -238,8 +243,174 @@ def _promised(
         episodes=episodes,
         violations=violations,
         rounds=tuple(rounds),
-        agreed=agreed,
+        agreed=rounds[-1]["quantile"] <= rounds[-1]["margin"],
         held=float((tested.shortfall <= guard.options.margin).mean()),
         infeasible_rate=tested.infeasible,
         **about,
     )
+
+
+class Trials(NamedTuple):
+    """E episodes, or windows of logs."""
+
+    violated: np.ndarray  # (E,) bool
+    shortfall: np.ndarray  # (E,)
+    infeasible: float  # share of steps in which the guard could not do what it should
+
+
+def shortfall(foreseen: np.ndarray, came: np.ndarray, late: int) -> np.ndarray:
+    """(E,) by how much what came scored less than what was foreseen, at worst; 0 where never. Scores (E, L) are of the
+    states that actions lead to, which act so many steps late."""
+    foreseen = foreseen[:, : foreseen.shape[1] - late]
+    return np.maximum(foreseen - came[:, late:], 0.0).max(1)
+
+
+def features(guard: Guard, homogeneous: bool, observations: Any, states: Any) -> Array:
+    """(B, teams, N, D) what a guard's World sees of B moments; homogeneous agents are so many teams of one."""
+    x = local_features(guard.world.map, homogeneous, observations, states)
+    return x.reshape(len(states if observations is None else observations), -1, *x.shape[1:])
+
+
+@jax.jit
+def least_score(guard: Guard, before: Array, after: Array) -> Array:
+    """(B,) of the steps between features (B, teams, N, D): of all agents and constraints."""
+    scores = guard.barrier.now(before, after)
+    return scores.reshape(len(scores), -1).min(-1)
+
+
+class Foresight:
+    """A `Watch` of B episodes: what a guard foresaw of every step, and how what came is scored, the least of all
+    agents."""
+
+    def __init__(self, guard: Guard, homogeneous: bool):
+        self.guard = guard
+        self.homogeneous = homogeneous
+        self.foreseen: list[np.ndarray] = []
+        self.came: list[np.ndarray] = []
+
+    def __call__(self, now: Moment) -> None:
+        """What came of a step, if it was shown."""
+        with float32():
+            before, after = (features(self.guard, self.homogeneous, *seen) for seen in (now.before, now.after))
+            came = np.asarray(least_score(self.guard, before, after))
+        self.foreseen.append(np.where(now.outcome.shown, np.asarray(now.decided.info[FORESEEN]), -np.inf))
+        self.came.append(np.where(now.outcome.shown, came, np.inf))
+
+    def shortfall(self) -> np.ndarray:
+        """(B,) as a certificate counts it."""
+        foreseen, came = np.stack(self.foreseen, 1), np.stack(self.came, 1)
+        return shortfall(foreseen, came, self.guard.options.delay)
+
+
+@dataclass(frozen=True)
+class Own:
+    """Episodes in a simulator of one's own: validation resets to calibrate on, test resets to count."""
+
+    make_env: Callable[[], Any]
+    faults: Faults
+    episodes: Mapping[Part, int]
+    cost: Cost | None = None
+    quiet: bool = True
+
+    def play(self, resolved: Resolved, part: Part, batch: int) -> Trials:
+        """Another `batch` has other resets."""
+        assert resolved.guard is not None, "refused before"
+        guard = resolved.guard
+        split = "test" if part == "test" else "validation"
+        player = player_of_run(resolved, split, self.faults)
+        count = self.episodes[part]
+        env = simulators_of(self.make_env, min(SIDE_BY_SIDE, count), player, self.cost)
+        first = RESETS[split] + batch * count * (part == "calibration")
+        label = f"{part} in {type(env.envs[0]).__name__} behind {self.faults.name}, margin {guard.options.margin:.3g}"
+        episodes: list[Episode] = []
+        watches: list[Foresight] = []
+
+        def watch() -> Foresight:
+            watches.append(Foresight(guard, resolved.job.task.homogeneous))
+            return watches[-1]
+
+        key = jax.random.key(resolved.run.config["seed"] + batch)
+        with Progress(label, count, 0, self.quiet) as bar:
+            play_all(player, env, range(first, first + count), key, bar, episodes, watch)
+        steps = sum(len(episode.rewards) for episode in episodes)
+        infeasible = sum(episode.counts["infeasible"] for episode in episodes)
+        violated = np.array([episode.team_costs.any() for episode in episodes])
+        return Trials(violated, np.concatenate([watch.shortfall() for watch in watches]), infeasible / max(steps, 1))
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Which simulator it was."""
+        return {"simulator": name_of(self.make_env)}
+
+
+@dataclass(frozen=True, eq=False)
+class Windowed:
+    """Two parts of the windows: the margin is calibrated on the first half of the logs, what it promises is counted on
+    the second."""
+
+    calibration: Stage
+    test: Stage
+    content: str  # digest of the logs
+    quiet: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        store: EpisodeStore,
+        run: Run,
+        world: World,
+        how: Body,
+        faults: Faults,
+        counts: Mapping[Part, int],
+        least: int,
+        quiet: bool,
+    ) -> Windowed:
+        """At most so many windows of each part, drawn evenly; fewer than `least` to calibrate on are refused."""
+        logs = Logs.of(store, run)
+        stage, _, _ = logs.stage(world, how, EVERY, run.config["seed"], faults)
+        w = stage.windows
+        moment = w.episode * (1 + w.start.max()) + w.start
+        first = moment < np.median(moment)  # everybody who is driven in the same moments is in the same half
+        to_calibrate, to_test = _evenly(first, counts["calibration"]), _evenly(~first, counts["test"])
+        if len(to_calibrate) < least:
+            raise UserError(
+                f"The first half of these logs has {len(to_calibrate)} windows, and a margin is calibrated on {least} "
+                "or more; give longer logs, shorter windows (steps=), or a smaller quantile=."
+            )
+        return cls(
+            dataclasses.replace(stage, windows=w.only(to_calibrate)),
+            dataclasses.replace(stage, windows=w.only(to_test)),
+            logs.store.card.content or logs.store.content,
+            quiet,
+        )
+
+    def play(self, resolved: Resolved, part: Part, batch: int) -> Trials:
+        """The windows of a part under the run's guard; another `batch` draws other noise."""
+        assert resolved.guard is not None, "refused before"
+        guard = resolved.guard
+        stage: Stage = getattr(self, part)
+        stage = dataclasses.replace(stage, seed=stage.seed + batch)
+        label = f"{part}, {stage.windows.count} windows, margin {guard.options.margin:.3g}"
+        with Progress(label, stage.windows.steps, 0, self.quiet) as bar:
+            driven = stage.play(resolved.proposal, Guarded(Nothing(), guard), bar=bar)
+        lacking = shortfall(driven.info[FORESEEN], stage.scores(guard, driven), guard.options.delay)
+        return Trials(driven.contact, lacking, float(driven.info["infeasible"].mean()))
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What a certificate says of how it was made."""
+        stage = self.test
+        replayed = {
+            "logs": self.content,
+            "windows": [self.calibration.windows.count, stage.windows.count],
+            "seconds": stage.windows.steps * stage.windows.dt,
+            "kinematics": stage.kinematics.name,
+            "radius": stage.radius,
+        }
+        return {"replayed": replayed}
+
+
+def _evenly(chosen: np.ndarray, most: int) -> np.ndarray:
+    """Where at most so many of the chosen (W,) are."""
+    found = np.flatnonzero(chosen)
+    return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(int)]

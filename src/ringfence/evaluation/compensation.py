@@ -66,13 +66,6 @@ def _missing_options(spec: PolicySpec, faults: Faults, guard_of: GuardOf) -> dic
     return found
 
 
-def _mean_age(jitter: int) -> float:
-    """Steps by which what is done is late in the mean, where an action may be late by up to `jitter`, each as likely,
-    and a newer one overtakes it: the sum of the chances that none of the last k has arrived."""
-    left = [(jitter - k) / (jitter + 1) for k in range(jitter)]
-    return float(np.cumprod(left).sum())
-
-
 def _steps_between(faults: Faults) -> float:
     """Steps from one decision to the next that is another, or from one observation to the next, in the mean."""
     return max(1 / (1 - faults.asynchrony), 1 / (1 - faults.drop))
@@ -88,7 +81,10 @@ def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
     guarded = options.get("guard", "none") != "none"
     if not guarded:
         raise UserError("compensate is read by nothing without a guard; name one with guard=, e.g. shield.")
-    delay = faults.delay + round(_mean_age(faults.jitter))
+    # Steps by which what is done is late in the mean, where an action may be late by up to `jitter`, each as likely,
+    # and a newer one overtakes it: the sum of the chances that none of the last k has arrived.
+    left = [(faults.jitter - k) / (faults.jitter + 1) for k in range(faults.jitter)]
+    delay = faults.delay + round(float(np.cumprod(left).sum()))
     found = {
         "delay": delay,
         "max_age": max(MAX_AGE - delay, 0) if faults.drop else 0,

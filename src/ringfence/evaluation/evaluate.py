@@ -16,11 +16,9 @@ from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.training import worlds
 from ringfence.training.runs import Run
-from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
-from ringfence.world.card import Card
 
 _log = logging.getLogger(__name__)
 
@@ -92,6 +90,11 @@ def about(resolved: Resolved) -> dict[str, Any]:
     run = resolved.run
     guard = resolved.guard
     options = resolved.plan_options
+    of_world: dict[str, Any] = {}
+    if guard is not None:
+        card = guard.world.card
+        of_world["world_settings"] = dataclasses.asdict(card.settings)
+        of_world |= {"verdict": card.verdict.word} if card.verdict is not None else {}  # one of before has none
     return {
         "algorithm": resolved.job.algorithm.name,
         "spec": spec.name,
@@ -104,17 +107,7 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "execution": worlds.execution_of(resolved.job.task, spec.execution),
         "agents": resolved.job.team,
         "guard_options": {} if guard is None else dataclasses.asdict(guard.options),
-        **({} if guard is None else _of_world(guard.world.card)),
+        **of_world,
         "train_seconds": sum(r["seconds"] for r in run.metrics),
-        "parameters": _parameters(resolved.policy),
+        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(resolved.policy))),
     }
-
-
-def _of_world(card: Card) -> dict[str, Any]:
-    """What a result says of the World that a guard asks; one of before has no verdict."""
-    verdict = {} if card.verdict is None else {"verdict": card.verdict.word}
-    return {"world_settings": dataclasses.asdict(card.settings), **verdict}
-
-
-def _parameters(policy: Policy) -> int:
-    return int(sum(np.size(x) for x in jax.tree.leaves(policy)))

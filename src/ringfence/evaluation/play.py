@@ -1,10 +1,17 @@
-"""Play a trained policy in anybody's simulator, through PettingZoo's parallel API."""
+"""Play a trained policy in anybody's simulator, through PettingZoo's parallel API; a command line names it."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib
+import importlib.util
+import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import jax
@@ -16,10 +23,9 @@ from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_num
 from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
-from ringfence.evaluation.places import filled, recording, watching
 from ringfence.evaluation.player import HasPolicy, Player, RunPlayer, player_of
-from ringfence.evaluation.rollout import COUNTED, RESETS, Acting
-from ringfence.evaluation.simulators import name_of
+from ringfence.evaluation.protocol import COUNTED, RESETS, Acting
+from ringfence.evaluation.recordings import Places, Recording, filled, recording, watching
 from ringfence.faults import Faults
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.entries import Names
@@ -74,62 +80,82 @@ def play(
     The summary is that of an evaluation (docs/data.md), without what needs a benchmark's constants.
     """
     keep_programs()
-    _check_sizes(episodes, num_envs, seed, max_episode_steps)
-    _check_choices(early_ends, split)
+    _check(episodes, num_envs, seed, max_episode_steps, early_ends, split)
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
-    if keep and faults.given:
-        raise UserError("keep=True adds to results.json, where no result has faults; leave keep or faults out.")
-    if compensate:
-        options = _compensated(run, faults, options)
-    player = player_of(run, planner, split, options, faults)
-    if keep:
-        _check_kept(player)
+    player = _player(run, planner, split, options, faults, compensate, keep)
     env = simulators_of(make_env, min(num_envs, episodes), player, cost, max_episode_steps, early_ends)
-    first = env.envs[0]
     begun = time.perf_counter()
-    played: list[Episode] = []
-    watches, watch_of = watching(_names_of(player, first), len(env.envs)) if keep else ([], lambda: nobody)
-    try:
-        with Progress(f"{player.name} in {type(first).__name__}", episodes, 0, quiet) as bar, interrupts.held(played):
-            resets = range(RESETS[split], RESETS[split] + episodes)
-            play_all(player, env, resets, jax.random.key(seed), bar, played, watch_of)
-    except UserError as error:
-        raise _with_finished(error, player, played) from error
-    except KeyboardInterrupt as stopped:
-        raise _interrupted(player, played, episodes) from stopped
+    played, watches = _played(player, env, range(RESETS[split], RESETS[split] + episodes), seed, keep, quiet)
     summary = _summary(player, played)
     about = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.about
     about |= {"compensated": compensate} if faults.given else {}
     if keep and isinstance(player, RunPlayer):
-        simulator = name_of(make_env, first)
-        of_file = {"split": split, "simulator": simulator, "num_envs": num_envs, "early_ends": early_ends}
-        words = ["--env", simulator, "--episodes", episodes, "--num-envs", num_envs]
-        words += [] if early_ends == "refuse" else ["--early-ends", early_ends]
-        words += [*split_words(split), *player.spec.words]
-        _add_to_run(player, summary | about | of_file | {"command": ["play", *map(str, words)]})
-        film = recording(watches, played)
-        recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))
+        how = {"split": split, "simulator": name_of(make_env, env.envs[0])}
+        how |= {"num_envs": num_envs, "early_ends": early_ends}
+        _keep(player, episodes, summary | about, how, recording(watches, played))
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}
     return shown | about | {"cost_limit": player.task.cost_limit}
 
 
-def _check_sizes(episodes: int, num_envs: int, seed: int, max_episode_steps: int | None) -> None:
+def _check(episodes: int, num_envs: int, seed: int, max_episode_steps: int | None, early_ends: str, split: str) -> None:
     whole_number("episodes", episodes, 1)
     whole_number("num_envs", num_envs, 1)
     whole_number("seed", seed, 0, LAST_SEED)
     if max_episode_steps is not None:
         whole_number("max_episode_steps", max_episode_steps, 1)
-
-
-def _check_choices(early_ends: str, split: str) -> None:
     known("early_ends", early_ends, EARLY_ENDS)
     known("split", split, RESETS)
 
 
-def _compensated(run: Run | str | HasPolicy, faults: Faults, options: dict[str, Any]) -> dict[str, Any]:
-    if isinstance(run, HasPolicy):
-        raise UserError("compensate is of a run's guard; give delay, max_age and hold to ringfence.guard() itself.")
-    return compensated(run, faults, options)
+def _player(
+    run: Run | str | HasPolicy,
+    planner: str,
+    split: str,
+    options: dict[str, Any],
+    faults: Faults,
+    compensate: bool,
+    keep: bool,
+) -> Player:
+    """Who plays; refused, before anything is played, where the result cannot be kept."""
+    if keep and faults.given:
+        raise UserError("keep=True adds to results.json, where no result has faults; leave keep or faults out.")
+    if compensate:
+        if isinstance(run, HasPolicy):
+            raise UserError("compensate is of a run's guard; give delay, max_age and hold to ringfence.guard() itself.")
+        options = compensated(run, faults, options)
+    player = player_of(run, planner, split, options, faults)
+    if not keep:
+        return player
+    if not isinstance(player, RunPlayer):
+        raise UserError("keep=True adds a result to a run's folder, and a function under guard has none; leave it out.")
+    _ = player.run.results
+    writable(player.run.path / "results.json")
+    return player
+
+
+def _played(
+    player: Player, env: SideBySide, resets: range, seed: int, filmed: bool, quiet: bool
+) -> tuple[list[Episode], list[Places]]:
+    """The episodes of these resets, and who watched the first of them where they are `filmed`. What stops it has the
+    summary of those that were finished."""
+    played: list[Episode] = []
+    label = f"{player.name} in {type(env.envs[0]).__name__}"
+    watches, watch_of = watching(_names_of(player, env.envs[0]), len(env.envs)) if filmed else ([], lambda: nobody)
+    try:
+        with Progress(label, len(resets), 0, quiet) as bar, interrupts.held(played):
+            play_all(player, env, resets, jax.random.key(seed), bar, played, watch_of)
+        return played, watches
+    except UserError as error:
+        if not (done := _done(played)):
+            raise
+        finished = f"({done} episodes were finished; the refusal's `finished` has their summary)."
+        raise PlayInterrupted(f"{str(error).rstrip('.')} {finished}", _summary(player, played)) from error
+    except KeyboardInterrupt as stopped:
+        done = _done(played)
+        summary = _summary(player, played) if done else {}
+        finished = {k: v for k, v in summary.items() if k not in OF_A_BENCHMARK} | player.about if done else None
+        message = f"interrupted; {done} of {len(resets)} episodes were finished, and nothing was added to results.json"
+        raise Interrupted(message, finished) from stopped
 
 
 def _names_of(player: Player, env: Any) -> Names:
@@ -139,9 +165,14 @@ def _names_of(player: Player, env: Any) -> Names:
     return Names.of(player.observation_names, states or (), len(env.possible_agents))
 
 
-def _add_to_run(player: RunPlayer, result: dict[str, Any]) -> None:
-    of_file = {"protocol": protocol.PROTOCOL, "variant": player.variant}
+def _keep(player: RunPlayer, episodes: int, result: dict[str, Any], how: dict[str, Any], film: Recording) -> None:
+    """Add a result to the run, with the command that makes it again, and the film beside it."""
+    words = ["--env", how["simulator"], "--episodes", episodes, "--num-envs", how["num_envs"]]
+    words += [] if how["early_ends"] == "refuse" else ["--early-ends", how["early_ends"]]
+    words += [*split_words(how["split"]), *player.spec.words]
+    of_file = how | {"command": ["play", *map(str, words)], "protocol": protocol.PROTOCOL, "variant": player.variant}
     player.run.add_result(player.variant, result | of_file)
+    recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))
 
 
 class PlayInterrupted(UserError):
@@ -153,36 +184,9 @@ class PlayInterrupted(UserError):
         self.finished = finished
 
 
-def _with_finished(error: UserError, player: Player, played: list[Episode]) -> UserError:
-    """The refusal, with what was finished before."""
-    done = _done(played)
-    if not done:
-        return error
-    message = f"{str(error).rstrip('.')} ({done} episodes were finished; the refusal's `finished` has their summary)."
-    return PlayInterrupted(message, _summary(player, played))
-
-
-def _interrupted(player: Player, played: list[Episode], episodes: int) -> Interrupted:
-    """Ctrl-C, with what was finished before."""
-    done = _done(played)
-    message = f"interrupted; {done} of {episodes} episodes were finished, and nothing was added to results.json"
-    finished = None
-    if done:
-        finished = {k: v for k, v in _summary(player, played).items() if k not in OF_A_BENCHMARK} | player.about
-    return Interrupted(message, finished)
-
-
 def _done(played: list[Episode]) -> int:
     """Episodes that were played to their end."""
     return sum(episode.over and not episode.skipped for episode in played)
-
-
-def _check_kept(player: Player) -> None:
-    """Refuse, before anything is played, a result that cannot be kept."""
-    if not isinstance(player, RunPlayer):
-        raise UserError("keep=True adds a result to a run's folder, and a function under guard has none; leave it out.")
-    _ = player.run.results
-    writable(player.run.path / "results.json")
 
 
 def _check_bounds(env: Any, bounds: Bounds) -> None:
@@ -236,20 +240,6 @@ def simulators_of(
     return SideBySide(envs, player.shape, max_steps, early_ends, cost, player.unsafe)
 
 
-def _warn_unless_repeated(env: SideBySide, seed: int) -> None:
-    """Say so where two resets with the same seed begin differently."""
-    begun: list[np.ndarray] = []
-    for _ in range(2):
-        env.reset([seed])
-        begun.append(env.observe().observations)
-    if not np.array_equal(*begun, equal_nan=True):
-        warnings.warn(
-            f"{env.episodes[0].name} begins differently at each reset(seed={seed}), so that no two policies are played "
-            "from the same starts; let its reset draw from that seed alone.",
-            stacklevel=4,
-        )
-
-
 def play_all(
     player: Player,
     env: SideBySide,
@@ -261,7 +251,18 @@ def play_all(
 ) -> None:
     """Episodes of these resets, as many at once as there are simulators. They are among `played` as soon as they have
     begun, so that who interrupts it loses none."""
-    _warn_unless_repeated(env, resets[0])
+    # Say so where two resets with the same seed begin differently.
+    seed = resets[0]
+    begun: list[np.ndarray] = []
+    for _ in range(2):
+        env.reset([seed])
+        begun.append(env.observe().observations)
+    if not np.array_equal(*begun, equal_nan=True):
+        warnings.warn(
+            f"{env.episodes[0].name} begins differently at each reset(seed={seed}), so that no two policies are played "
+            "from the same starts; let its reset draw from that seed alone.",
+            stacklevel=4,
+        )
     acting = Acting(player.policy)
     keys = split_off(key)
     for first in range(0, len(resets), len(env.envs)):
@@ -294,28 +295,92 @@ def _summary(player: Player, begun: list[Episode]) -> dict[str, Any]:
     if not played:
         raise UserError(f"All {len(every)} episodes were skipped, since agents left them; pass early_ends='cut'.")
     counts = {k: np.array([e.counts[k] for e in played]) for k in played[0].counts}
-    summary = protocol.summarise(_arrays(played) | counts, player.task, np.array([e.unsafe_start for e in played]))
-    if cut := sum(episode.was_cut for episode in played):
-        summary["cut_episodes"] = cut
-    if len(played) < len(every):
-        summary["skipped_episodes"] = len(every) - len(played)
-    if played[0].constraints:
-        summary["constraints"] = {k: _of_constraint(played, k, player.limits) for k in played[0].constraints[0]}
-    return summary
-
-
-def _of_constraint(played: list[Episode], name: str, limits: Mapping[str, float]) -> dict[str, Any]:
-    """Of one constraint: the team's cost per episode, its limit, and the share of episodes within it."""
-    costs = np.array([sum(float(np.max(c[name])) for c in e.constraints) for e in played])
-    return protocol.of_constraint(costs, limits.get(name))
-
-
-def _arrays(played: list[Episode]) -> dict[str, np.ndarray]:
-    """`rewards`, `costs` (E, L), `steps`, `terminated` (E,); nothing happens after an episode's end."""
+    # `rewards`, `costs` (E, L), `steps`, `terminated` (E,); nothing happens after an episode's end.
     steps = np.array([len(e.rewards) for e in played])
-    return {
+    arrays = {
         "rewards": np.stack([filled(e.team_rewards, steps.max(), 0.0) for e in played]),
         "costs": np.stack([filled(e.team_costs, steps.max(), 0.0) for e in played]),
         "steps": steps,
         "terminated": np.array([e.terminated for e in played]),
     }
+    summary = protocol.summarise(arrays | counts, player.task, np.array([e.unsafe_start for e in played]))
+    if cut := sum(episode.was_cut for episode in played):
+        summary["cut_episodes"] = cut
+    if len(played) < len(every):
+        summary["skipped_episodes"] = len(every) - len(played)
+    if played[0].constraints:
+        # The team's cost per episode of each.
+        summary["constraints"] = {
+            name: protocol.of_constraint(
+                np.array([sum(float(np.max(c[name])) for c in e.constraints) for e in played]), player.limits.get(name)
+            )
+            for name in played[0].constraints[0]
+        }
+    return summary
+
+
+@dataclass(frozen=True)
+class NamedSimulator:
+    """What makes a simulator, and the name that it was given by."""
+
+    name: str
+    make: Callable[[], Any]
+
+    def __call__(self) -> Any:
+        return self.make()
+
+
+def simulator(name: str) -> NamedSimulator:
+    """What makes the simulator named FILE.py:NAME or MODULE:NAME, a class or a function without arguments."""
+    where, _, attribute = name.rpartition(":")
+    if not where or not attribute.isidentifier():
+        raise UserError(f"'{name}' names no simulator; write FILE.py:NAME or MODULE:NAME of what makes a ParallelEnv.")
+    make = getattr(_imported(where, attribute), attribute, None)
+    if not callable(make):
+        raise UserError(
+            f"'{where}' has no {attribute} that can be called; name the class, or the function, that makes one."
+        )
+    return NamedSimulator(name, make)
+
+
+def name_of(make_env: Callable[[], Any], env: Any = None) -> str:
+    """The name a simulator was given by, else that of its class, or of what makes it."""
+    if isinstance(make_env, NamedSimulator):
+        return make_env.name
+    made = make_env if env is None else type(env)
+    return f"{made.__module__}:{getattr(made, '__qualname__', type(made).__qualname__)}"
+
+
+def _of_file(file: Path) -> ModuleType:
+    """The module of a file; one whose name another module has already, e.g. `queue`, gets a name of its own."""
+    known = sys.modules.get(file.stem)
+    if known is None or getattr(known, "__file__", None) == str(file):
+        return importlib.import_module(file.stem)
+    name = f"{file.stem}_{hashlib.blake2b(str(file).encode(), digest_size=4).hexdigest()}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None and spec.loader is not None, "a file that ends in .py"
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _imported(where: str, attribute: str) -> ModuleType:
+    """The module of a file, or of a name that is found from the working folder."""
+    file = Path(where)
+    is_file = file.suffix == ".py"
+    if is_file and not file.is_file():
+        raise UserError(f"'{where}' is no file; give the one that holds {attribute}.")
+    sys.path.insert(0, str(file.resolve().parent if is_file else Path.cwd()))
+    try:
+        return _of_file(file.resolve()) if is_file else importlib.import_module(where)
+    except Exception as error:  # it is anybody's code
+        raise UserError(f"'{where}' cannot be imported ({type(error).__name__}: {error}); repair it first.") from error
+    finally:
+        sys.path.pop(0)

@@ -74,13 +74,53 @@ def player_of(
 ) -> Player:
     """A run as planner and options say, or a function under guard, which takes neither; behind faults, if any."""
     if isinstance(policy, HasPolicy):
-        return _behind(_of_function(policy.policy, planner, options), faults)
+        callback = policy.policy
+        if not isinstance(callback, Callback):
+            raise UserError("This controller is of a run; play the run itself, with its options beside it.")
+        if options or planner != DEFAULT:
+            raise UserError(
+                f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here."
+            )
+        world = callback.guarded.guard.world
+        spec = world.spec
+        bound = constraints.bind_or_none(world.hazard, spec.feature_names, spec.n_agents)
+        player = Player(
+            name="a function under guard",
+            policy=_OneByOne(callback),
+            task=Task(spec.task, None, world.hazard, action_low=spec.action_low, action_high=spec.action_high),
+            shape=shape_of(world, callback.agents),
+            episode_length=spec.episode_length,
+            action_dim=spec.action_dim,
+            observation_names=(),
+            unsafe=_unsafe_by_formula(bound, world.map, spec.homogeneous),
+            about={"guard": "own"},
+            limits=world.limits,
+        )
+        return _behind(player, faults)
     return player_of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split, faults)
 
 
 def player_of_run(resolved: Resolved, split: str, faults: Faults = NO_FAULTS) -> Player:
     """What a spec named, behind faults, if any."""
-    return _behind(_of_run(resolved, split), faults)
+    job = resolved.job
+    observation, state = job.widths
+    names = resolved.run.config["data"].get("observation_names") or getattr(job.task.env, "observation_names", ())
+    player = RunPlayer(
+        name=job.algorithm.name,
+        policy=resolved.team,
+        task=job.task,
+        shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins, names=resolved.run.agents),
+        episode_length=job.spec.episode_length,
+        action_dim=job.spec.action_dim,
+        observation_names=tuple(names) if len(names) == observation else (),
+        unsafe=_unsafe_by_formula(job.hazard, job.feature_map, job.task.homogeneous),
+        about={"step": resolved.step, "variant": resolved.variant(split)} | evaluate.about(resolved),
+        limits=resolved.run.config["data"].get("constraints") or {},
+        spec=resolved.spec,
+        run=resolved.run,
+        variant=resolved.variant(split),
+    )
+    return _behind(player, faults)
 
 
 def _behind(player: Player, faults: Faults) -> Player:
@@ -100,32 +140,6 @@ def _behind(player: Player, faults: Faults) -> Player:
     return dataclasses.replace(player, policy=policy, about=player.about | {"faults": dataclasses.asdict(faults)})
 
 
-def _of_run(resolved: Resolved, split: str) -> RunPlayer:
-    job = resolved.job
-    observation, state = job.widths
-    return RunPlayer(
-        name=job.algorithm.name,
-        policy=resolved.team,
-        task=job.task,
-        shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins, names=resolved.run.agents),
-        episode_length=job.spec.episode_length,
-        action_dim=job.spec.action_dim,
-        observation_names=_names_of(resolved),
-        unsafe=_unsafe_by_formula(job.hazard, job.feature_map, job.task.homogeneous),
-        about={"step": resolved.step, "variant": resolved.variant(split)} | evaluate.about(resolved),
-        limits=resolved.run.config["data"].get("constraints") or {},
-        spec=resolved.spec,
-        run=resolved.run,
-        variant=resolved.variant(split),
-    )
-
-
-def _names_of(resolved: Resolved) -> tuple[str, ...]:
-    env = resolved.job.task.env
-    names = resolved.run.config["data"].get("observation_names") or getattr(env, "observation_names", ())
-    return tuple(names) if len(names) == resolved.job.widths[0] else ()
-
-
 def _unsafe_by_formula(hazard: BoundHazard | None, map: FeatureMap, homogeneous: bool) -> Unsafe | None:
     if hazard is None or not hazard.has_formula:
         return None
@@ -136,28 +150,6 @@ def _unsafe_by_formula(hazard: BoundHazard | None, map: FeatureMap, homogeneous:
         return found.reshape(len(observations), -1).any(-1)
 
     return in_float32(lambda observations, state: np.asarray(unsafe(observations, state)))
-
-
-def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Player:
-    if not isinstance(callback, Callback):
-        raise UserError("This controller is of a run; play the run itself, with its options beside it.")
-    if options or planner != DEFAULT:
-        raise UserError(f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here.")
-    world = callback.guarded.guard.world
-    spec = world.spec
-    bound = constraints.bind_or_none(world.hazard, spec.feature_names, spec.n_agents)
-    return Player(
-        name="a function under guard",
-        policy=_OneByOne(callback),
-        task=Task(spec.task, None, world.hazard, action_low=spec.action_low, action_high=spec.action_high),
-        shape=shape_of(world, callback.agents),
-        episode_length=spec.episode_length,
-        action_dim=spec.action_dim,
-        observation_names=(),
-        unsafe=_unsafe_by_formula(bound, world.map, spec.homogeneous),
-        about={"guard": "own"},
-        limits=world.limits,
-    )
 
 
 def shape_of(world: World, agents: int) -> Shape:

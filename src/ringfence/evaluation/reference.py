@@ -33,8 +33,18 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     that `kept` (E,) names."""
     if kept is None:
         kept = np.ones(store.episodes, bool)
-    played = _played(store)
-    result = summarise({name: array[kept] for name, array in played.items()}, task, _unsafe_starts(store, task)[kept])
+    # Logged episodes as `rollout` gives played ones: rewards and costs (E, L), 0 after an episode's end.
+    there = np.arange(int(store.lengths.max())) < store.lengths[:, None]
+    rewards = np.zeros(there.shape)
+    rewards[there] = store.rewards.mean(1)
+    costs = np.zeros(there.shape)
+    costs[there] = store.team_costs
+    played = {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": store.episode_terminated}
+    unsafe = np.zeros(store.episodes, bool)
+    if store.state is not None and task.env is not None:  # a simulator says which starts are unsafe
+        first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
+        unsafe = unsafe_starts(task, store.state[first])
+    result = summarise({name: array[kept] for name, array in played.items()}, task, unsafe[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
 
@@ -57,24 +67,6 @@ def of_run(run: Run, constants: dict[str, Any]) -> dict[str, Any] | None:
     if logs["constraints"]:
         result["constraints"] = {k: of_constraint(np.array(c), limits.get(k)) for k, c in logs["constraints"].items()}
     return result | {"split": "data"}
-
-
-def _played(store: EpisodeStore) -> dict[str, np.ndarray]:
-    """Logged episodes as `rollout` gives played ones: rewards and costs (E, L), 0 after an episode's end."""
-    there = np.arange(int(store.lengths.max())) < store.lengths[:, None]
-    rewards = np.zeros(there.shape)
-    rewards[there] = store.rewards.mean(1)
-    costs = np.zeros(there.shape)
-    costs[there] = store.team_costs
-    return {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": store.episode_terminated}
-
-
-def _unsafe_starts(store: EpisodeStore, task: Task) -> np.ndarray:
-    """(E,) whether a logged episode starts unsafe; False where no simulator says so."""
-    if store.state is None or task.env is None:
-        return np.zeros(store.episodes, bool)
-    first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
-    return unsafe_starts(task, store.state[first])
 
 
 def there(task: Task, out: str | Path, episodes: int, transitions: int | None = None) -> bool:
@@ -117,18 +109,14 @@ def make(
     rows = {LOGS: of_data(store, task) | {"data": store.card.to_dict()}}
     if safe.any():
         rows[SAFE] = of_data(store, task, safe)
-    for name, policy in _policies(task).items():
-        rows[name], _ = evaluate_policy(policy, task, episodes, label=name, quiet=quiet)
-    write_json(file, rows)
-    return rows
-
-
-def _policies(task: Task) -> dict[str, Policy]:
-    """Doing nothing, acting at random, and the references of the task's own recipe."""
+    # Doing nothing, acting at random, and the references of the task's own recipe.
     spec = task.spec(task.feature_map("pruned"))
     policies: dict[str, Policy] = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
     if task.homogeneous:
         policies = {name: PerAgent(policy, task.simulator.n_agents) for name, policy in policies.items()}
     if task.recipe is not None:
         policies |= task.recipe.references(task)
-    return policies
+    for name, policy in policies.items():
+        rows[name], _ = evaluate_policy(policy, task, episodes, label=name, quiet=quiet)
+    write_json(file, rows)
+    return rows

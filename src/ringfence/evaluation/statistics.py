@@ -124,7 +124,9 @@ def stratified_bootstrap(
 
     `statistic` maps (draws, R, M) to (draws, ...), e.g. `iqm`. One run has no interval: it is refused.
     """
-    x = _several(scores)
+    x = _matrix(scores)
+    if len(x) < 2:
+        raise UserError("One run per task says nothing about the spread between runs; an interval needs two or more.")
     parts = [statistic(part) for part in _resamples(x, draws, np.random.default_rng(seed))]
     return _percentiles(np.concatenate(parts), level)
 
@@ -194,13 +196,6 @@ def _matrix(scores: ArrayLike) -> np.ndarray:
     x = np.asarray(scores, np.float64)
     if x.ndim != 2 or not x.size:
         raise UserError(f"Scores of shape {x.shape} are not a table; pass (runs, tasks).")
-    return x
-
-
-def _several(scores: ArrayLike) -> np.ndarray:
-    x = _matrix(scores)
-    if len(x) < 2:
-        raise UserError("One run per task says nothing about the spread between runs; an interval needs two or more.")
     return x
 
 

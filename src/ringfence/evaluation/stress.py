@@ -12,9 +12,8 @@ from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.certificate import digest
 from ringfence.evaluation.compensation import compensated_spec
 from ringfence.evaluation.evaluate import Split, about
-from ringfence.evaluation.play import play
+from ringfence.evaluation.play import name_of, play
 from ringfence.evaluation.protocol import evaluate_policy
-from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
 from ringfence.loading.resolve import load_job, resolve
 from ringfence.loading.spec import PolicySpec

@@ -60,23 +60,13 @@ def of_run(run: Run) -> list[Row]:
     """Every evaluation that a run folder holds."""
     results = run.results
     config = run.config if results else {}
-    return [_of_run(run, config, name, result) for name, result in results.items()]
-
-
-def _of_run(run: Run, config: Mapping[str, Any], name: str, result: Result) -> Row:
-    dated = "@step" in name or of_last_step(result, config["config"])
-    return Row(
-        task=config["task"],
-        algorithm=config["algorithm"],
-        preset=config["preset"],
-        variant=name if dated else f"{name}@step{result['step']}",
-        seed=config["seed"],
-        result=result,
-        file=run.path / "results.json",
-        name=name,
-        run=run,
-        config=config,
-    )
+    found = []
+    for name, result in results.items():
+        dated = "@step" in name or of_last_step(result, config["config"])
+        variant = name if dated else f"{name}@step{result['step']}"
+        who = (config["task"], config["algorithm"], config["preset"], variant, config["seed"])
+        found.append(Row(*who, result, run.path / "results.json", name, run, config))
+    return found
 
 
 def of_references(file: Path, task: str) -> list[Row]:
@@ -104,8 +94,15 @@ def check(rows: Iterable[Row], declared: Mapping[str, Any] | None = None, by: st
             for name in ("protocol",) if row.split == "data" else ("protocol", "split", "episodes"):
                 _check_same(row, name, declared[name], by)
         _check_same(row, "constants", leader.result["constants"], leader.where)
-        if row.run is not None:
-            _check_data(row, trained.setdefault(row.task, row))
+        if row.run is None:
+            continue
+        first = trained.setdefault(row.task, row)
+        if unlike := other_data(row.data, first.data):
+            what, here, there = unlike[0]
+            raise UserError(
+                f"'{row.file.parent}' was trained on other data (its {what} is {here}) than '{first.file.parent}' "
+                f"({there}); such numbers cannot stand in one table: give each data set one of its own."
+            )
 
 
 def _check_whole(row: Row) -> None:
@@ -126,13 +123,4 @@ def _check_same(row: Row, name: str, wanted: Any, whose: str) -> None:
         raise UserError(
             f"{row.where} has {name} {row.result[name]}, {whose} has {wanted}; such numbers cannot stand in one table: "
             "evaluate one of them again, or keep it in a folder of its own."
-        )
-
-
-def _check_data(row: Row, first: Row) -> None:
-    if unlike := other_data(row.data, first.data):
-        name, here, there = unlike[0]
-        raise UserError(
-            f"'{row.file.parent}' was trained on other data (its {name} is {here}) than '{first.file.parent}' "
-            f"({there}); such numbers cannot stand in one table: give each data set one of its own."
         )

@@ -98,10 +98,25 @@ def resolve(spec: PolicySpec) -> Resolved:
     run = spec.run
     job = load_job(run, spec.agents)
     world = worlds.of_run(run) if job.reads_world else None
-    step, policy = _trained(run, job, world, spec)
+    read = {} if world is None else {"world": world}
+
+    def blank() -> PyTree:
+        state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard, **read)
+        return loop.learned(state)
+
+    step, state = run.load_checkpoint(jax.eval_shape(blank), spec.checkpoint)
+    if world is not None and job.algorithm.from_world is not None:
+        state |= {"world": job.algorithm.from_world(world, job.config)}
+    policy = make_policy(job, state, {**PLANNERS[spec.planner], **dict(spec.plan_options)})
     plans = isinstance(policy, TakesPlanOptions)
-    if not plans:
-        _refuse_target(job, dict(spec.plan_options))
+    asked = dict(spec.plan_options)
+    if not plans and "target_return" in asked:  # the other options of plans are passed over
+        name = job.algorithm.name
+        remedy = "set it when it is trained" if hasattr(job.config, "target_return") else "leave it out"
+        raise UserError(
+            f"target_return={asked['target_return']} asks for a return, and {name} is asked for none when it plays; "
+            f"{remedy}."
+        )
     if isinstance(policy, TakesGuidance):
         policy = _guided(policy, run, job, world, spec)
     if spec.guarded and spec.barrier == oracle.ORACLE:
@@ -122,17 +137,6 @@ def resolve(spec: PolicySpec) -> Resolved:
     # Homogeneous agents see for themselves anyway.
     spec = dataclasses.replace(spec, execution=None) if job.task.homogeneous else spec
     return Resolved(spec, job, policy, step)
-
-
-def _refuse_target(job: Job, options: dict[str, Any]) -> None:
-    """Whoever draws no plans passes over how they are drawn, but for a return that is asked for in vain."""
-    if "target_return" in options:
-        name = job.algorithm.name
-        remedy = "set it when it is trained" if hasattr(job.config, "target_return") else "leave it out"
-        raise UserError(
-            f"target_return={options['target_return']} asks for a return, and {name} is asked for none when it plays; "
-            f"{remedy}."
-        )
 
 
 def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:
@@ -169,25 +173,18 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
     return guided(policy, world, WHOLE if asked is None else asked)
 
 
-def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple[int, Policy]:
-    """(step, policy) of the checkpoint, without a guard."""
-    read = {} if world is None else {"world": world}
-
-    def blank() -> PyTree:
-        state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard, **read)
-        return loop.learned(state)
-
-    step, state = run.load_checkpoint(jax.eval_shape(blank), spec.checkpoint)
-    if world is not None and job.algorithm.from_world is not None:
-        state |= {"world": job.algorithm.from_world(world, job.config)}
-    return step, make_policy(job, state, {**PLANNERS[spec.planner], **dict(spec.plan_options)})
-
-
 def load_job(run: Run, agents: int | None = None) -> Job:
     """The job that a run folder holds, rebuilt from its config.json; played by another number of `agents` where they
     are homogeneous."""
     stored = run.config
-    _refuse_lacking(run, stored)
+    file = run.path / "config.json"
+    for name in ("spec", "feature_map"):
+        if name not in stored:
+            raise UserError(f"'{file}' lacks '{name}', so nothing can be played; train it again.")
+    needed = {f.name for f in dataclasses.fields(Spec) if f.default is dataclasses.MISSING}
+    lacking = sorted(needed - set(stored["spec"]))
+    if lacking:
+        raise UserError(f"'{file}' has a spec without '{lacking[0]}'; train the run again.")
     algorithm = algos.get(stored["algorithm"])
     config = build_config(algorithm.Config, stored["config"], algorithm.name)
     spec = Spec.of(stored["spec"])
@@ -201,7 +198,20 @@ def load_job(run: Run, agents: int | None = None) -> Job:
         team = task.simulator.n_agents
         widths = widths_of(task)
     else:
-        task = _task_of_data(stored, hazard, spec)
+        # A task that exists only as data, as the run's card has it.
+        card = stored["data"]
+        low, high = stored.get("returns") or (0.0, 1.0)
+        task = Task(
+            stored["task"],
+            None,
+            hazard,
+            return_min=low,
+            return_max=high,
+            cost_limit=float(card.get("cost_limit", 1.0)),
+            action_low=spec.action_low,
+            action_high=spec.action_high,
+            homogeneous=spec.homogeneous,
+        )
         feature_map = features.from_dict(stored["feature_map"])
         team = stored.get("team", spec.n_agents)
         widths = stored.get("widths") or (None, None)
@@ -221,34 +231,6 @@ def _check_width(job: Job, map: features.FeatureMap, who: str) -> None:
     beyond = map.beyond(observation, state or None)  # 0 where nobody reads it
     if beyond is not None:
         raise UserError(f"{who} reads {beyond}; it is of other data.")
-
-
-def _refuse_lacking(run: Run, stored: Mapping[str, Any]) -> None:
-    file = run.path / "config.json"
-    for name in ("spec", "feature_map"):
-        if name not in stored:
-            raise UserError(f"'{file}' lacks '{name}', so nothing can be played; train it again.")
-    needed = {f.name for f in dataclasses.fields(Spec) if f.default is dataclasses.MISSING}
-    lacking = sorted(needed - set(stored["spec"]))
-    if lacking:
-        raise UserError(f"'{file}' has a spec without '{lacking[0]}'; train the run again.")
-
-
-def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: Spec) -> Task:
-    """A task that exists only as data, as the run's card has it."""
-    card = stored["data"]
-    low, high = stored.get("returns") or (0.0, 1.0)
-    return Task(
-        stored["task"],
-        None,
-        hazard,
-        return_min=low,
-        return_max=high,
-        cost_limit=float(card.get("cost_limit", 1.0)),
-        action_low=spec.action_low,
-        action_high=spec.action_high,
-        homogeneous=spec.homogeneous,
-    )
 
 
 def make_policy(job: Job, state: PyTree, options: Mapping[str, Any]) -> Policy:

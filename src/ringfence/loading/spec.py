@@ -71,7 +71,13 @@ class PolicySpec:
         _known("execution", execution or "centralized", EXECUTIONS)
         if barrier is not None:
             _known("barrier", barrier, SOURCES)
-        of_plans, of_guard = _by_owner(options)
+        guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
+        plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
+        for name in options:
+            if name not in guard_names + plan_names:
+                raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
+        of_plans = {name: value for name, value in options.items() if name not in guard_names}
+        of_guard = {name: value for name, value in options.items() if name in guard_names}
         if agents is not None:
             whole_number("agents", agents, 1, 100_000)
         spec = cls(
@@ -88,7 +94,9 @@ class PolicySpec:
             anyway=anyway,
         )
         if not spec.guarded:
-            _refuse_unread(barrier=barrier, world=None if options.get("barrier_guidance") else world)
+            for name, given in (("barrier", barrier), ("world", None if options.get("barrier_guidance") else world)):
+                if given is not None:
+                    raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
         return spec
 
     @classmethod
@@ -152,24 +160,6 @@ class PolicySpec:
     def without_plans(self) -> PolicySpec:
         """The same of a policy that draws no plans, which reads no choice of planners."""
         return replace(self, planner=DEFAULT, plan_options=())
-
-
-def _refuse_unread(**choices: Any) -> None:
-    """Of a guard, where there is none."""
-    for name, given in choices.items():
-        if given is not None:
-            raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
-
-
-def _by_owner(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The options of PlanOptions, and those of GuardOptions; others are refused."""
-    guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
-    plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
-    for name in options:
-        if name not in guard_names + plan_names:
-            raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
-    of_plans = {name: value for name, value in options.items() if name not in guard_names}
-    return of_plans, {name: value for name, value in options.items() if name in guard_names}
 
 
 def _known(kind: str, name: Any, known: Any) -> None:

@@ -1,4 +1,5 @@
-"""A results folder of the benchmark as a board: its tasks' ranked tables, and what the grid lacks.
+"""A results folder of the benchmark as a board: its tasks' ranked tables, what the grid lacks, and what compares
+methods: paired tests on a task, and statistics over all tasks.
 
 A preset made for the task (its data tier's, or its simulator's) is that algorithm's default there: one method over all
 tasks.
@@ -6,22 +7,28 @@ tasks.
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from ringfence.bench import suites, table
 from ringfence.bench.cells import cell_status, read_about
 from ringfence.bench.table import Place
 from ringfence.datasets import registry
+from ringfence.datasets.registry import TASKS
 from ringfence.errors import UserError
 from ringfence.evaluation import statistics
-from ringfence.evaluation.table import Row
-from ringfence.report.table import Line, Method, Section, methods_of, paint, section
+from ringfence.evaluation.statistics import Interval
+from ringfence.evaluation.table import Result, Row
+from ringfence.report.table import Line, Method, Section, methods_of, normal_cost, normal_return, paint, section
 from ringfence.training.runs import Run
 
 FILE = "bench.json"
+DRAWS = 2000  # of every bootstrap
 
 
 @dataclass(frozen=True)
@@ -93,33 +100,31 @@ def read(folder: str | Path) -> Board:
     tasks = sorted(named, key=lambda t: (known.index(t) if t in known else len(known), t))
     jobs = {_job(place.task, place.job) for place in places}
     missing = _missing(about["suite"], places, finished, tasks)
-    return Board(
-        path=folder,
-        suite=about["suite"],
-        protocol=about["protocol"],
-        split=about["split"],
-        episodes=about["episodes"],
-        sections=_sections(tasks, found, [row for row in rows if row.run is None]),
-        seeds=tuple(sorted({place.seed for place in places})),
-        missing=sorted(missing, key=lambda m: (tasks.index(m.task), m.job, m.seed)),
-        unstarted=[e.name for e in _suite(about["suite"]) if _entry_job(e) not in jobs],
-        untouched=[t for t in _suite_tasks(about["suite"]) if t not in named],
-    )
-
-
-def _sections(tasks: list[str], rows: list[Row], references: list[Row]) -> dict[str, Section]:
-    """By task, its lines ranked, in the same colours everywhere."""
-    methods = methods_of(rows)
+    # By task, its lines ranked, in the same colours everywhere.
+    references = [row for row in rows if row.run is None]
+    methods = methods_of(found)
     made = {}
     for task in tasks:
-        mine, beside = ([row for row in some if row.task == task] for some in (rows, references))
+        mine, beside = ([row for row in some if row.task == task] for some in (found, references))
         made[task] = section(task, mine, beside, methods)
     lines = [line for each in made.values() for line in each.lines]
     order = _methods(made.values())
     paint(sorted(lines, key=lambda line: order.index(line.method) if line.method else 0))
     for each in made.values():
         each.tables = {split: ranked(lines, each.constants["cost_limit"]) for split, lines in each.tables.items()}
-    return made
+    suite = suites.SUITES.get(about["suite"])
+    return Board(
+        path=folder,
+        suite=about["suite"],
+        protocol=about["protocol"],
+        split=about["split"],
+        episodes=about["episodes"],
+        sections=made,
+        seeds=tuple(sorted({place.seed for place in places})),
+        missing=sorted(missing, key=lambda m: (tasks.index(m.task), m.job, m.seed)),
+        unstarted=[e.name for e in (suite.entries if suite else ()) if _entry_job(e) not in jobs],
+        untouched=[t for t in (suite.tasks if suite else ()) if t not in named],
+    )
 
 
 def _methods(sections: Iterable[Section]) -> list[Method]:
@@ -151,14 +156,21 @@ def _by_default(row: Row) -> Row:
 
 def _missing(suite: str, places: list[Place], finished: list[Place], tasks: list[str]) -> list[Missing]:
     """What the grid lacks: evaluations of finished cells, cells without any, and cells that were not begun."""
-    partial = [m for place in finished if (m := _partial(suite, place))]
+    found = [lacking for place in finished if (lacking := _partial(suite, place))]
     done = {_cell(place) for place in finished}
-    unfinished = [_unfinished(place) for place in places if _cell(place) not in done]
+    for place in places:
+        if _cell(place) not in done:
+            state, reason = _status(place.path)
+            found.append(Missing(place.task, place.job, place.seed, f"{state}: {reason}" if reason else state))
     begun = {_cell(place) for place in places}
     jobs = sorted({job for _, job, _ in begun})
     seeds = sorted({place.seed for place in places})
-    grid = [(task, job, seed) for task in tasks for job in jobs for seed in seeds if _planned(suite, task, job)]
-    return partial + unfinished + [Missing(*cell, "not started") for cell in grid if cell not in begun]
+    for task, job in itertools.product(tasks, jobs):
+        # Jobs that the suite does not know are expected on every task.
+        entries = [e for e in _suite(suite) if _entry_job(e) == job]
+        if not entries or any(e.plays(_tier(task)) for e in entries):
+            found += [Missing(task, job, seed, "not started") for seed in seeds if (task, job, seed) not in begun]
+    return found
 
 
 def _cell(place: Place) -> tuple[str, str, int]:
@@ -170,17 +182,14 @@ def _partial(suite: str, cell: Place) -> Missing | None:
     """What a cell with results lacks, if anything."""
     state, reason = _status(cell.path)
     if state == "failed":
-        why = f"not every evaluation is there, one failed: {reason}"
-    elif lacking := _lacking(suite, cell):
-        why = f"not every evaluation is there: {', '.join(lacking)}"
-    else:
+        return Missing(cell.task, cell.job, cell.seed, f"not every evaluation is there, one failed: {reason}")
+    known = {result.get("spec") for result in Run(cell.path).results.values()}
+    _, job, _ = _cell(cell)
+    entries = [e for e in _suite(suite) if _entry_job(e) == job and e.plays(_tier(cell.task))]
+    lacking = [name for e in entries for name in e.evaluations if name not in known]
+    if not lacking:
         return None
-    return Missing(cell.task, cell.job, cell.seed, why)
-
-
-def _unfinished(cell: Place) -> Missing:
-    state, reason = _status(cell.path)
-    return Missing(cell.task, cell.job, cell.seed, f"{state}: {reason}" if reason else state)
+    return Missing(cell.task, cell.job, cell.seed, f"not every evaluation is there: {', '.join(lacking)}")
 
 
 def _status(path: Path) -> tuple[str, str]:
@@ -209,24 +218,182 @@ def _suite(name: str) -> tuple[suites.Entry, ...]:
     return suites.SUITES[name].entries if name in suites.SUITES else ()
 
 
-def _suite_tasks(name: str) -> tuple[str, ...]:
-    return suites.SUITES[name].tasks if name in suites.SUITES else ()
-
-
 def _entry_job(entry: suites.Entry) -> str:
     """The folder's name of a suite's entry, as `_job` has it."""
     return entry.algorithm if entry.preset in ("", "default") else f"{entry.algorithm}-{entry.preset}"
 
 
-def _planned(suite: str, task: str, job: str) -> bool:
-    """Whether the suite has this job on this task; jobs it does not know are expected on every task."""
-    entries = [e for e in _suite(suite) if _entry_job(e) == job]
-    return not entries or any(e.plays(_tier(task)) for e in entries)
+@dataclass(frozen=True)
+class Contest:
+    """The first of a task against another method on the same resets, every reset averaged over a method's seeds.
+
+    Differences are first minus other, with 95 % intervals over resets; p-values are Wilcoxon's signed-rank test,
+    adjusted after Holm over all contests of the task, returns and costs together.
+    """
+
+    other: Line
+    returns: float
+    returns_interval: Interval
+    returns_p: float
+    cost: float
+    cost_interval: Interval
+    cost_p: float
 
 
-def _lacking(suite: str, cell: Place) -> list[str]:
-    """Evaluations of the suite that a run does not have."""
-    known = {result.get("spec") for result in Run(cell.path).results.values()}
-    _, job, _ = _cell(cell)
-    entries = [e for e in _suite(suite) if _entry_job(e) == job and e.plays(_tier(cell.task))]
-    return [name for e in entries for name in e.evaluations if name not in known]
+@dataclass
+class Aggregate:
+    """What holds over all tasks, for the methods that were measured on every one of them.
+
+    Scores are arrays (seeds, tasks): normalised return, and normalised cost, whose limit is 1.
+    """
+
+    protocol: str  # what the tasks have in common, where a board has several
+    tasks: list[str]
+    methods: list[Method]
+    seeds: dict[Method, tuple[int, ...]]  # those that every task has
+    left_out: dict[Method, list[str]]  # method -> tasks without a result; none: no seed has all tasks
+    returns: dict[Method, np.ndarray]
+    costs: dict[Method, np.ndarray]
+    iqm_returns: dict[Method, tuple[float, Interval | None]]  # no interval of one seed
+    iqm_costs: dict[Method, tuple[float, Interval | None]]
+    improves: np.ndarray  # (M, M): probability that the row's return beats the column's
+    cheaper: np.ndarray  # (M, M): probability that the row's cost is below the column's
+    return_thresholds: np.ndarray  # (K,)
+    return_profiles: np.ndarray  # (M, K)
+    return_bands: list[np.ndarray | None]  # (2, K) pointwise 95 % intervals, runs resampled within each task
+    cost_thresholds: np.ndarray  # (K,)
+    cost_profiles: np.ndarray  # (M, K)
+    cost_bands: list[np.ndarray | None]
+
+
+def contests(lines: list[Line]) -> list[Contest]:
+    """The first of a task's ranked lines against each of the others."""
+    if len(lines) < 2:
+        return []
+    first = lines[0]
+    others = lines[1:]
+    returns = [statistics.paired_test(_per_reset(first, "return"), _per_reset(other, "return")) for other in others]
+    costs = [statistics.paired_test(_per_reset(first, "cost"), _per_reset(other, "cost")) for other in others]
+    adjusted = statistics.holm([test["p"] for test in (*returns, *costs)])
+    returns_p = adjusted[: len(others)]
+    costs_p = adjusted[len(others) :]
+    return [
+        Contest(
+            other=other,
+            returns=returns[k]["difference"],
+            returns_interval=returns[k]["interval"],
+            returns_p=float(returns_p[k]),
+            cost=costs[k]["difference"],
+            cost_interval=costs[k]["interval"],
+            cost_p=float(costs_p[k]),
+        )
+        for k, other in enumerate(others)
+    ]
+
+
+def _per_reset(line: Line, what: str) -> np.ndarray:
+    return np.mean([row.result["per_episode"][what] for row in line.rows], 0)
+
+
+# --- over all tasks ---
+
+
+def aggregates(board: Board) -> list[Aggregate]:
+    """One per protocol that the board's tasks follow: tasks that share data and policies under two limits are not two
+    tasks. Protocols without a method that was measured on every task with one and the same seed are left out."""
+    made = [aggregate(board, protocol, tasks) for protocol, tasks in by_protocol(board).items()]
+    return [x for x in made if x is not None]
+
+
+def by_protocol(board: Board) -> dict[str, list[str]]:
+    """The board's tasks by what their limit follows."""
+    found: dict[str, list[str]] = {}
+    for task in board.tasks:
+        found.setdefault(TASKS[task].protocol if task in TASKS else "", []).append(task)
+    return found
+
+
+def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) -> Aggregate | None:
+    """Statistics over tasks (by default all); None where no method was measured on every one with the same seed."""
+    tasks = board.tasks if tasks is None else tasks
+    # By method the seeds that every task has; by method without any the tasks that lack it.
+    seeds: dict[Method, tuple[int, ...]] = {}
+    left_out: dict[Method, list[str]] = {}
+    for method in board.methods:
+        lines = {task: board.line(task, method) for task in tasks}
+        had = {task: set(line.seeds) if line else set() for task, line in lines.items()}
+        common = tuple(sorted(set.intersection(*had.values())))
+        if common:
+            seeds[method] = common
+        else:
+            left_out[method] = [task for task in tasks if not had[task]]
+    methods = list(seeds)
+    if not methods:
+        return None
+
+    def scores(score: Callable[[Result, dict[str, float]], float | np.ndarray]) -> dict[Method, np.ndarray]:
+        """(seeds, tasks, ...) of every method."""
+        found = {}
+        for m in methods:
+            by_task = [{row.seed: row.result for row in line.rows} for t in tasks if (line := board.line(t, m))]
+            each = [[score(results[seed], results[seed]["constants"]) for results in by_task] for seed in seeds[m]]
+            found[m] = np.array(each)
+        return found
+
+    returns = scores(lambda result, constants: normal_return(result["return_mean"], constants))
+    costs = scores(lambda result, constants: normal_cost(result["cost_mean"], constants))
+    episode_costs = scores(lambda result, constants: normal_cost(np.array(result["per_episode"]["cost"]), constants))
+    # From the worst to the best run, at least from 0 to 1.
+    low = min(0.0, *(float(s.min()) for s in returns.values()))
+    high = max(1.0, *(float(s.max()) for s in returns.values()))
+    return_thresholds = np.linspace(low, high, 101)
+    # From 0 to where nine of ten episodes of every method lie, at least to 3. Whole numbers are among them, since costs
+    # count steps.
+    most = max(float(np.quantile(costs, 0.9)) for costs in episode_costs.values())
+    top = int(np.ceil(max(3.0, most)))
+    cost_thresholds = np.linspace(0.0, top, 20 * top + 1)
+    above = {m: (returns[m][..., None] > return_thresholds).astype(float) for m in methods}
+    within = {m: (episode_costs[m][..., None] <= cost_thresholds).mean(2) for m in methods}
+    return Aggregate(
+        protocol=protocol,
+        tasks=tasks,
+        methods=methods,
+        seeds=seeds,
+        left_out=left_out,
+        returns=returns,
+        costs=costs,
+        iqm_returns={m: _iqm(returns[m]) for m in methods},
+        iqm_costs={m: _iqm(costs[m]) for m in methods},
+        improves=_pairs(returns, methods),
+        cheaper=_pairs({m: -c for m, c in costs.items()}, methods),
+        return_thresholds=return_thresholds,
+        return_profiles=np.array([statistics.profile(returns[m], return_thresholds) for m in methods]),
+        return_bands=[_band(above[m]) for m in methods],
+        cost_thresholds=cost_thresholds,
+        cost_profiles=np.array([statistics.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
+        cost_bands=[_band(within[m]) for m in methods],
+    )
+
+
+def _iqm(scores: np.ndarray) -> tuple[float, Interval | None]:
+    """Interquartile mean over all seeds and tasks; the bootstrap resamples seeds within each task."""
+    middle = float(statistics.iqm(scores))
+    if len(scores) < 2:
+        return middle, None
+    low, high = statistics.stratified_bootstrap(scores, statistics.iqm, draws=DRAWS)
+    return middle, (float(low), float(high))
+
+
+def _band(shares: np.ndarray) -> np.ndarray | None:
+    """(2, K): 95 % interval, at every threshold, of the mean of shares (runs, tasks, K); runs are resampled."""
+    runs, tasks, _ = shares.shape
+    if runs < 2:
+        return None
+    drawn = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), (DRAWS, tasks))
+    means = np.einsum("dmr,rmk->dk", drawn / (runs * tasks), shares, optimize=True)
+    return np.percentile(means, [2.5, 97.5], axis=0)
+
+
+def _pairs(scores: dict[Method, np.ndarray], methods: list[Method]) -> np.ndarray:
+    """(M, M) probability that a run of the row scores higher than one of the column, averaged over tasks."""
+    return np.array([[statistics.probability_of_improvement(scores[a], scores[b]) for b in methods] for a in methods])

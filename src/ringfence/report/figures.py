@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +14,23 @@ from typing import Any
 import matplotlib
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
+from ringfence.errors import UserError
 from ringfence.report.table import COLOURS, Line, Section, Style
+from ringfence.training.runs import Run
 
 MARKERS = "osD^vPX*"
 FAR = 8.0  # times the limit: axes of cost that reach further are not linear
 INK, GRID = "#010203", "#010204"
+AGENT = 0
+OTHER = 1  # who is moved around the agent
+SPEED = 1.0  # m/s at which it approaches
+GRID_SIDE = np.linspace(-1.0, 1.0, 81)  # m
 
 
 class Ticks(LogFormatter):
@@ -159,46 +166,39 @@ def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) ->
         made, columns = figure_with_legend(8.2, 4.4, [line.label for line in points])
         ax = made.add_subplot()
         for line in points:
-            _point(ax, line)
+            ink = INK if line.reference else colour(line.style)
+            x = line.cost_safe_start
+            y = line.returns
+            ax.plot(line.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
+            ax.plot((x, x), line.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
+            look = {
+                "color": ink,
+                "mfc": "none" if line.reference else ink,
+                "markersize": 7,
+                "zorder": 3,
+                "linestyle": "none",
+            }
+            ax.plot(x, y, marker=marker(line.style), label=line.label, **look)
         ax.margins(0.08, 0.1)
         several = any(line.limits for line in points)  # one line is no limit of theirs
-        _cost_axis(ax, section.constants["cost_limit"] if section.constants and not several else 0.0)
+        # The limit as a line, and costs by their square roots where they reach far beyond it.
+        limit = section.constants["cost_limit"] if section.constants and not several else 0.0
+        low, high = ax.get_xlim()
+        if limit > 0:  # beside the points, where it is in view
+            ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
+        if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
+            ax.set_xscale(
+                "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * x**2)
+            )
+            ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
+            ax.set_xlim(-0.002 * high, 1.1 * high)
+        else:
+            ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
         ax.set_xlabel(f"{x_label}, safe starts")
         ax.set_ylabel("return per episode")
         made.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
         each = [f"{r.label}: return {r.returns:.1f}, cost of safe starts {r.cost_safe_start:.3f}" for r in points]
         return to_svg(made, f"Return against the cost of safe starts on {section.task}. {'; '.join(each)}", name)
-
-
-def _point(ax: Axes, line: Line) -> None:
-    ink = INK if line.reference else colour(line.style)
-    x = line.cost_safe_start
-    y = line.returns
-    ax.plot(line.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
-    ax.plot((x, x), line.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
-    look = {"color": ink, "mfc": "none" if line.reference else ink, "markersize": 7, "zorder": 3, "linestyle": "none"}
-    ax.plot(x, y, marker=marker(line.style), label=line.label, **look)
-
-
-def _cost_axis(ax: Axes, limit: float) -> None:
-    """The limit as a line, and costs by their square roots where they reach far beyond it."""
-    low, high = ax.get_xlim()
-    if limit > 0:  # beside the points, where it is in view
-        ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
-    if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
-        ax.set_xscale("function", functions=(_root, _square))
-        ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
-        ax.set_xlim(-0.002 * high, 1.1 * high)
-    else:
-        ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
-
-
-def _root(x: np.ndarray) -> np.ndarray:
-    return np.sign(x) * np.sqrt(np.abs(x))
-
-
-def _square(x: np.ndarray) -> np.ndarray:
-    return np.sign(x) * x**2
 
 
 # --- training ---
@@ -245,3 +245,141 @@ def _curves(title: str, y_label: str, logarithmic: bool, curves: list[Curve], na
         ax.set_ylabel(y_label)
         ax.set_xlabel("update")
         return to_svg(made, f"{title} during training, one thin line per seed", name)
+
+
+@dataclass(frozen=True)
+class Around:
+    """States in which one agent is moved over a grid around another."""
+
+    base: np.ndarray  # (N, D) features of the state that the others stay in
+    position: np.ndarray  # (N, 2)
+    velocity: np.ndarray  # (N, 2)
+    names: Sequence[str]  # of features
+
+    @property
+    def relative(self) -> bool:
+        """Whether features say where others are, seen from the agent; else they say where everybody is."""
+        return "other0.dx" in self.names
+
+    @property
+    def tells(self) -> bool:
+        """Whether features say where the other agent is."""
+        return self.relative or f"agent{OTHER}.x" in self.names
+
+    @property
+    def has_velocity(self) -> bool:
+        return ("other0.dvx" if self.relative else f"agent{OTHER}.vx") in self.names
+
+    @property
+    def rest(self) -> np.ndarray:
+        """(N − 2, 2) where the remaining agents are, seen from the agent."""
+        others = [j for j in range(len(self.position)) if j not in (AGENT, OTHER)]
+        return (self.position[others] - self.position[AGENT]).reshape(-1, 2)
+
+    def states(self, approach: float) -> np.ndarray:
+        """(81², N, D) features, the other agent approaching at this speed."""
+        dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
+        distance = np.maximum(np.hypot(dx, dy), 1e-6)
+        x = np.broadcast_to(self.base, (dx.size, *self.base.shape)).copy()
+        for c, (axis, away) in enumerate(zip("xy", (dx, dy))):
+            speed = approach * (-away / distance).ravel()
+            if self.relative:
+                x[:, AGENT, self.names.index(f"other0.d{axis}")] = away.ravel()
+                if self.has_velocity:
+                    x[:, AGENT, self.names.index(f"other0.dv{axis}")] = speed
+                continue
+            x[:, :, self.names.index(f"agent{OTHER}.{axis}")] = (self.position[AGENT, c] + away.ravel())[:, None]
+            if self.has_velocity:
+                x[:, :, self.names.index(f"agent{OTHER}.v{axis}")] = (self.velocity[AGENT, c] + speed)[:, None]
+        return x
+
+
+def field(run: Run, state: np.ndarray | None, name: str) -> Drawn | None:
+    """h of one agent around it, one other agent moved over a grid; None where there is no barrier or the features do
+    not say where others are. `state` (S,) is a real state; None takes a reset."""
+    found = _barrier_around(run, state)
+    if found is None:
+        return None
+    around, barrier, radius = found
+    cases = {"at rest relative to the agent": 0.0}
+    if around.has_velocity:
+        cases[f"approaching at {SPEED:g} m/s"] = SPEED
+    shape = (len(GRID_SIDE), len(GRID_SIDE))
+    fields = {case: barrier(around.states(speed))[:, AGENT].reshape(shape) for case, speed in cases.items()}
+    dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
+    contact = np.maximum(np.hypot(dx, dy), 1e-6) < radius
+    told = []
+    for case, h in fields.items():
+        inside, outside = (100 * float((h[part] < 0).mean()) for part in (contact, ~contact))
+        told.append(f"{case}, h < 0 on {inside:.0f} % of the area in contact and on {outside:.0f} % of the rest")
+    about = "; ".join(told)
+    label = f"Learned barrier of agent {AGENT} around it. With the other agent {about}."
+    rest = around.rest
+    rings = ("", "Rings: the remaining agent, where in view. ", "Rings: the remaining agents, where in view. ")
+    said = (
+        f"h of one agent (+) as one other agent is moved around it in a {'reset' if state is None else 'recorded'} "
+        f"state. Solid: where h = 0. Dashed: true contact, at {radius:.2f} m. {rings[min(len(rest), 2)]}With the other "
+        f"agent {about}."
+    )
+    return Drawn(label, _draw_fields(fields, radius, rest, label, name), said)
+
+
+Barrier = Callable[[np.ndarray], np.ndarray]  # of features (B, N, D), for each agent (B, N)
+
+
+def _barrier_around(run: Run, state: np.ndarray | None) -> tuple[Around, Barrier, float] | None:
+    """What a run knows danger by, where from, and the radius of contact."""
+    import jax
+    import jax.numpy as jnp
+
+    from ringfence.loading.resolve import load
+    from ringfence.nets.layers import barrier_on
+    from ringfence.training import worlds
+
+    if not run.checkpoints():
+        raise UserError(f"'{run.path}' holds no checkpoint.")
+    job, loaded = load(run)
+    policy: Any = loaded  # whatever planner it is
+    networks = getattr(policy, "networks", {})
+    learned = worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
+    radius = getattr(job.hazard.hazard, "radius", None)
+    n = job.spec.n_agents
+    if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:
+        return None
+    env: Any = job.task.env
+    reset = env.reset(jax.random.key(1), 1) if state is None else env.from_global_state(jnp.asarray(state)[None])
+    base = np.array(policy.feature_map(env.observe(reset), env.global_state(reset)))[0]
+    flat = np.asarray(env.global_state(reset))[0]
+    position = flat[: 2 * n].reshape(n, 2)
+    velocity = flat[2 * n : 4 * n].reshape(n, 2)
+    around = Around(base, position, velocity, job.spec.feature_names)
+
+    def barrier(features: np.ndarray) -> np.ndarray:
+        x = jnp.asarray(features)
+        h = barrier_on(networks["barrier"], policy.normaliser, x) if learned is None else learned.of_steps(x, x)
+        return np.asarray(h)
+
+    return (around, barrier, radius) if around.tells else None
+
+
+def _draw_fields(fields: dict[str, np.ndarray], radius: float, rest: np.ndarray, label: str, name: str) -> Markup:
+    most = max(np.abs(h).max() for h in fields.values()) or 1.0
+    near = rest[np.abs(rest).max(1) < 1] if len(rest) else rest
+    scale = TwoSlopeNorm(0.0, -most, most)
+    with style(axes_grid=False):
+        made = figure(4.1 * len(fields) + 0.7, 4.0)
+        axes = made.subplots(1, len(fields), squeeze=False, sharey=True)[0]
+        for ax, (case, h) in zip(axes, fields.items()):
+            extent = (-1.0125, 1.0125, -1.0125, 1.0125)
+            ax.imshow(h, origin="lower", extent=extent, cmap="RdBu", norm=scale, interpolation="bilinear")
+            if h.min() < 0 < h.max():
+                ax.contour(GRID_SIDE, GRID_SIDE, h, [0.0], colors="black", linewidths=1.8)
+            ax.add_patch(Circle((0, 0), radius, fill=False, linestyle="--", edgecolor="black", linewidth=1.2))
+            ax.plot(0, 0, "+", color="black")
+            if len(near):
+                ax.plot(near[:, 0], near[:, 1], "o", mfc="none", color="black", markersize=9)
+            ax.set(title=f"other agent {case}", xlabel="other agent's x − own x (m)", xlim=(-1, 1), ylim=(-1, 1))
+        axes[0].set_ylabel("other agent's y − own y (m)")
+        bar = made.colorbar(axes[-1].images[0], ax=list(axes), shrink=0.85)
+        bar.set_label("h  (negative: judged unsafe)")
+        return to_svg(made, label, name)

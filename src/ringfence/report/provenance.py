@@ -63,11 +63,13 @@ def _whole(card: Mapping[str, Any], name: str) -> int | None:
 def _training(section: Section, data: str) -> list[str]:
     """A line for the seeds of one algorithm, preset, settings and root folder: one that follow each other, else of
     each."""
+    presets = registry.TASKS[section.task].presets if section.task in registry.TASKS else ()
     jobs: dict[tuple[tuple[str, ...], tuple[str, ...]], list[int]] = {}
     for run in section.runs:
         config = run.config
         words = ["train", config["algorithm"], data]
-        if config["preset"] != _usual_preset(config["algorithm"], section.task):
+        known = algos.ALGORITHMS.get(config["algorithm"])
+        if known is None or config["preset"] != known.preset_for(presets):
             words += ["--preset", config["preset"]]
         root = str(run.path.parent.parent.parent)
         last = [] if root == "runs" else ["--out", root]
@@ -81,14 +83,6 @@ def _training(section: Section, data: str) -> list[str]:
         for first, count in [(seeds[0], len(seeds))] if together else [(seed, 1) for seed in seeds]:
             lines.append(_line([*words, "--seeds", count, *(["--first-seed", first] if first else []), *last]))
     return lines
-
-
-def _usual_preset(algorithm: str, task: str) -> str:
-    """The preset that training takes by default; no name where that is not known."""
-    known = algos.ALGORITHMS.get(algorithm)
-    if known is None:
-        return ""
-    return known.preset_for(registry.TASKS[task].presets if task in registry.TASKS else ())
 
 
 def _playing(section: Section) -> list[str]:

@@ -7,13 +7,15 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from ringfence.algos import ALGORITHMS
 from ringfence.errors import UserError
-from ringfence.evaluation import reference
-from ringfence.evaluation.table import SPLITS, Row, check, of_reference, of_references, of_run
-from ringfence.report.pooling import Numbers, mean_of, pool, return_span
+from ringfence.evaluation import reference, statistics
+from ringfence.evaluation.statistics import Interval
+from ringfence.evaluation.table import SPLITS, Result, Row, check, of_reference, of_references, of_run
 from ringfence.training.runs import LOGS, Run, runs_below
 from ringfence.utils.config import fields_of
 
@@ -35,6 +37,7 @@ NAMES = {
 ORDER = list(NAMES)  # lines of the table; algorithms that are not named here come last
 COLOURS = 10  # series colours in style.css
 Style = tuple[int, int]  # colour, marker
+Number = TypeVar("Number", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,33 @@ class Method:
         parts = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", self.shown)]
         first = self.preset.startswith("algorithm1")
         return rank, self.algorithm, not first, [(isinstance(p, str), p) for p in parts]
+
+
+@dataclass(kw_only=True)
+class Numbers:
+    """Per episode, over all runs of a line. Intervals are 95 %."""
+
+    episodes: int  # over all runs
+    returns: float
+    returns_interval: Interval
+    returns_norm: float
+    cost: float
+    cost_interval: Interval
+    cost_norm: float
+    cost_safe_start: float
+    cost_safe_start_interval: Interval
+    returns_sd: float | None  # between runs; None of one
+    cost_sd: float | None
+    violations: int
+    violation_upper: float  # exact, one-sided, of the resets on which any run has one
+    unsafe_starts: int
+    cvar: float  # mean of the tenth of episodes with the highest cost
+    safe: bool  # the upper end of the cost's interval is within the limit, and so it is of every named constraint
+    limits: dict[str, float] = field(default_factory=dict)  # per episode, of the constraints that are named
+
+    @property
+    def violation_rate(self) -> float:
+        return self.violations / self.episodes
 
 
 @dataclass(kw_only=True)
@@ -137,7 +167,12 @@ class Section:
 def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Section]:
     """One section per task of evaluated runs, in the order in which the runs name them."""
     rows: dict[str, list[Row]] = {}
-    for run in _distinct([runs] if isinstance(runs, str | Path | Run) else runs):
+    distinct: dict[Path, Run] = {}  # the same folder named twice counts once
+    for each in [runs] if isinstance(runs, str | Path | Run) else runs:
+        below = [] if isinstance(each, Run) else runs_below(Path(each))
+        for run in below or [Run.of(each)]:
+            distinct.setdefault(run.path.resolve(), run)
+    for run in distinct.values():
         found = of_run(run)
         if not found:
             raise UserError(
@@ -148,16 +183,6 @@ def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Sectio
     if not rows:
         raise UserError("No run was given, so there is nothing to report; pass run folders made by `ringfence train`.")
     return [_section_of_runs(task, mine) for task, mine in rows.items()]
-
-
-def _distinct(runs: Iterable[Run | str | Path]) -> list[Run]:
-    """Folders become runs; the same folder named twice counts once."""
-    found: dict[Path, Run] = {}
-    for each in runs:
-        below = [] if isinstance(each, Run) else runs_below(Path(each))
-        for run in below or [Run.of(each)]:
-            found.setdefault(run.path.resolve(), run)
-    return list(found.values())
 
 
 def _section_of_runs(task: str, rows: list[Row]) -> Section:
@@ -233,7 +258,9 @@ def methods_of(rows: Iterable[Row]) -> dict[Row, Method]:
         groups.setdefault((row.algorithm, row.preset, row.task), []).append(mine)
     apart: dict[tuple[str, str], dict[str, None]] = {}
     for (algorithm, preset, _), several in groups.items():
-        apart.setdefault((algorithm, preset), {}).update(dict.fromkeys(_differing(several)))
+        fields = dict.fromkeys(k for one in several for k in one)
+        differing = [k for k in fields if len({json.dumps(one.get(k)) for one in several}) > 1]
+        apart.setdefault((algorithm, preset), {}).update(dict.fromkeys(differing))
     found = {}
     for row, mine in settings.items():
         words = ", ".join(f"{k}={mine.get(k)}" for k in apart[row.algorithm, row.preset])
@@ -247,11 +274,6 @@ def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
     known = ALGORITHMS.get(config["algorithm"])  # none of somebody else's
     defaults = {} if known is None else {name: f.default for name, f in fields_of(known.Config).items()}
     return defaults | config["config"] | {"revision": config.get("revision", 1)}
-
-
-def _differing(settings: list[dict[str, Any]]) -> list[str]:
-    fields = dict.fromkeys(k for one in settings for k in one)
-    return [k for k in fields if len({json.dumps(one.get(k)) for one in settings}) > 1]
 
 
 def paint(lines: Iterable[Line]) -> None:
@@ -268,3 +290,125 @@ def paint(lines: Iterable[Line]) -> None:
             taken[colour] = taken.get(colour, -1) + 1
             styles[*family, line.label] = colour, taken[colour]
         line.style = styles[*family, line.label]
+
+
+def pool(results: list[Result], name: str = "the runs of a line") -> Numbers:
+    """The summaries of a line's runs as one. `UserError` if they played different numbers of resets.
+
+    The interval of one run speaks of its episodes alone, that of several also of what another seed would have trained.
+    """
+    measured = _of_one(results[0]) if len(results) == 1 else _of_several(results, name)
+    constants = results[0]["constants"]
+    limits = limits_of(results)
+    costs = [(r.get("constraints", {}).get(name, {}), limit) for r in results for name, limit in limits.items()]
+    # By the upper ends of the costs' intervals; what was not measured is not kept.
+    kept = all(c and not c.get("cost_interval", (0.0, c["cost_mean"]))[1] > limit for c, limit in costs)
+    means = [(c.get("cost_mean", np.inf), limit) for c, limit in costs]
+    shares = [cost / limit if limit > 0 else np.inf if cost > 0 else 0.0 for cost, limit in means]  # 1 at the limit
+    return Numbers(
+        **measured,
+        episodes=sum(r["episodes"] for r in results),
+        returns_sd=_deviation(results, "return_mean"),
+        cost_sd=_deviation(results, "cost_mean"),
+        violations=sum(map(_violations, results)),
+        returns_norm=normal_return(measured["returns"], constants),
+        cost_norm=float(max(0.0, *shares)) if limits else normal_cost(measured["cost"], constants),
+        safe=kept and measured["cost_interval"][1] <= constants["cost_limit"],
+        limits=limits,
+    )
+
+
+def _deviation(results: list[Result], key: str) -> float | None:
+    return float(np.std([r[key] for r in results], ddof=1)) if len(results) > 1 else None
+
+
+def limits_of(results: Iterable[Result]) -> dict[str, float]:
+    """The limit of every constraint that a result names. Their sum is no limit: what one leaves, another must not
+    use up."""
+    limits: dict[str, float] = {}
+    for result in results:
+        for name, constraint in result.get("constraints", {}).items():
+            if constraint.get("limit") is not None:
+                limits[name] = min(constraint["limit"], limits.get(name, constraint["limit"]))
+    return limits
+
+
+def _of_one(result: Result) -> dict[str, Any]:
+    """Its own numbers: it may be of logged data, whose episodes are not kept one by one."""
+    return {
+        "returns": result["return_mean"],
+        "returns_interval": tuple(result["return_interval"]),
+        "cost": result["cost_mean"],
+        "cost_interval": tuple(result["cost_interval"]),
+        "cost_safe_start": result["cost_safe_start"],
+        "cost_safe_start_interval": tuple(result["cost_safe_start_interval"]),
+        "unsafe_starts": result["unsafe_starts"],
+        "cvar": result["cost_cvar10"],
+        "violation_upper": statistics.upper_bound(_violations(result), result["episodes"]),
+    }
+
+
+def _of_several(results: list[Result], name: str) -> dict[str, Any]:
+    """From the episodes (runs, resets) of all."""
+    played = [r["episodes"] for r in results]
+    if len(set(played)) > 1:
+        raise UserError(
+            f"{name} were played for {min(played)} and for {max(played)} episodes, which are not the same resets; "
+            "evaluate all of them with the same --episodes."
+        )
+    returns = _episodes(results, "return")
+    cost = _episodes(results, "cost")
+    unsafe = _episodes(results, "unsafe_start")
+    if unsafe.all():  # nothing is known of safe starts: no cost
+        safe_start = np.ones_like(unsafe, bool)
+        cost_safe_start = np.zeros_like(cost)
+    else:
+        safe_start = unsafe == 0
+        cost_safe_start = cost
+    return {
+        "returns": float(returns.mean()),
+        "returns_interval": statistics.mean_of_runs(returns),
+        "cost": float(cost.mean()),
+        "cost_interval": statistics.mean_of_runs(cost, least=0.0),
+        "cost_safe_start": float(cost_safe_start[safe_start].mean()),
+        "cost_safe_start_interval": statistics.mean_of_runs(cost_safe_start, safe_start, least=0.0),
+        "unsafe_starts": int(unsafe.sum()),
+        "cvar": statistics.cvar(cost.ravel()),
+        # Runs share their resets, which alone are independent; a mean over runs is at most this share of them.
+        "violation_upper": statistics.upper_bound(int((cost > 0).any(0).sum()), cost.shape[1]),
+    }
+
+
+def _episodes(results: list[Result], what: str) -> np.ndarray:
+    return np.array([r["per_episode"][what] for r in results], float)
+
+
+def _violations(result: Result) -> int:
+    return round(result["violation_rate"] * result["episodes"])
+
+
+def normal_return(x: Number, constants: dict[str, float]) -> Number:
+    """0 at return_min, 1 at return_max."""
+    return (x - constants["return_min"]) / return_span(constants)
+
+
+def normal_cost(x: Number, constants: dict[str, float]) -> Number:
+    """1 at the limit."""
+    return (x + constants["cost_offset"]) / _span(constants["cost_limit"] + constants["cost_offset"])
+
+
+def return_span(constants: dict[str, float]) -> float:
+    """What lies between normalised returns of 0 and 1."""
+    return _span(constants["return_max"] - constants["return_min"])
+
+
+def _span(size: float) -> float:
+    if not size:
+        raise UserError("A result's constants say that 0 and 1 are the same return or cost; evaluate its run again.")
+    return size
+
+
+def mean_of(results: Iterable[Mapping[str, Any]], key: str) -> float | None:
+    """Mean of what the summaries say under `key`; None where none says it."""
+    values = [r[key] for r in results if r.get(key) is not None]
+    return float(np.mean(values)) if values else None

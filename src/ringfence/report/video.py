@@ -29,6 +29,7 @@ from ringfence.utils.files import whole
 
 EVERY = 2  # steps per frame, at least
 LONGEST = 200  # frames
+COLOURS = 64  # of a film
 # MUJOCO_GL's values that can work on a platform (others are Linux), and what to do where none does.
 BACKENDS = {"darwin": ("cgl",), "win32": ("wgl",)}
 HELP = "install EGL (Debian: libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6)"
@@ -125,7 +126,7 @@ def moments(costs: np.ndarray) -> list[tuple[int, bool]]:
     return [(t, bool(costs[max(0, t - every) : t].any())) for t in times]
 
 
-def with_one_palette(pictures: list, colours: int = 64) -> list:
+def with_one_palette(pictures: list) -> list:
     """RGB pictures in the same few colours, those of bars and words among them: nothing flickers, nothing is lost."""
     from PIL import Image
 
@@ -138,7 +139,7 @@ def with_one_palette(pictures: list, colours: int = 64) -> list:
     for k, colour in enumerate(DRAWN):
         top = len(some) * height + k * stripe
         sample.paste(colour, (0, top, width, top + stripe))
-    palette = sample.quantize(colours)
+    palette = sample.quantize(COLOURS)
     return [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
 
 

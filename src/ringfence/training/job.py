@@ -115,16 +115,13 @@ def _bound(task: Task, spec: Spec, cost_source: str, view: str, store: EpisodeSt
     except UserError:
         if cost_source not in ("labels", "world"):
             return constraints.bind(constraints.CostColumn(), spec.feature_names, spec.n_agents)
-        if view != "pruned" and store is not None and _binds(task, store):
-            raise UserError(
-                f"The view '{view}' leaves out what the hazard {type(task.hazard).__name__} reads; set view=pruned."
-            ) from None
+        if view != "pruned" and store is not None:
+            names = task.feature_map("pruned", store).names
+            if constraints.bind_or_none(task.hazard, names, store.n_agents) is not None:
+                raise UserError(
+                    f"The view '{view}' leaves out what the hazard {type(task.hazard).__name__} reads; set view=pruned."
+                ) from None
         raise
-
-
-def _binds(task: Task, store: EpisodeStore) -> bool:
-    names = task.feature_map("pruned", store).names
-    return constraints.bind_or_none(task.hazard, names, store.n_agents) is not None
 
 
 def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, cost_source: str) -> None:

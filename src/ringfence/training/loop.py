@@ -82,7 +82,9 @@ def train(
     _check_store(data)
     seeds = _seeds(seeds)
     of_kind("changes", changes, Mapping | None, "give a dictionary of settings")
-    _check_counts(chunk=chunk, checkpoint_every=checkpoint_every)
+    for name, value in (("chunk", chunk), ("checkpoint_every", checkpoint_every)):
+        if value is not None:
+            whole_number(name, value, 1)
     if tensorboard:
         _summary_writer()
     require_resolved(data)
@@ -128,12 +130,6 @@ def _check_store(data: EpisodeStore) -> None:
             f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
             "ringfence.datasets.make.make(ringfence.datasets.registry.get(NAME))[0]."
         )
-
-
-def _check_counts(**counts: int | None) -> None:
-    for name, value in counts.items():
-        if value is not None:
-            whole_number(name, value, 1)
 
 
 @contextmanager
@@ -304,7 +300,15 @@ class _Training:
         arrays: Arrays = {}
         for run, seed, root in zip(runs, seeds, roots):
             world, windows = lessons.of(seed)
-            states.append(_begun(job, run, root, world, windows))
+            # A seed's state: fresh, or that of its last checkpoint. The World that it reads is kept beside it.
+            read = {} if world is None else {"world": world}
+            key = jax.random.fold_in(root, 2**31 - 1)
+            begun = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **read)
+            if world is not None and not (run.path / worlds.WORLD).exists():
+                save_world(world, run.path / worlds.WORLD)
+            if run.checkpoints():
+                begun = begun | run.load_checkpoint(learned(begun))[1]
+            states.append(begun)
             scores.append(windows.arrays["scores"])
             arrays = {name: array for name, array in windows.arrays.items() if name != "scores"}
         steps = sorted({int(state["step"]) for state in states})
@@ -314,7 +318,12 @@ class _Training:
                 "by one."
             )
         for run in runs:
-            _trim_metrics(run, steps[0])
+            # Drop log lines past the checkpoint that training resumes from.
+            rows = [r for r in run.metrics if r["step"] <= steps[0]]
+            file = run.path / "metrics.jsonl"
+            if file.exists():
+                with whole(file) as temporary:
+                    temporary.write_text("".join(json.dumps(r) + "\n" for r in rows))
         whose = f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} seeds"
         tensorboard = [_summary_writer()(str(run.path / "tensorboard")) for run in runs if options.tensorboard]
         return cls(
@@ -347,7 +356,8 @@ class _Training:
                     if self.step // every > (self.step - count) // every or self.step == steps:
                         self._save()
             except KeyboardInterrupt:
-                if self.saved < self.step and not _deleted(self.state):
+                # Inside a compiled call it leaves donated buffers behind; there is nothing to save then.
+                if self.saved < self.step and not any(x.is_deleted() for x in jax.tree.leaves(self.state)):
                     self._save()
                 raise
         if self.saved < self.step:
@@ -393,18 +403,6 @@ class _Training:
         self.saved = self.step
 
 
-def _begun(job: Job, run: Run, root: Key, world: World | None, windows: WindowData) -> PyTree:
-    """A seed's state: fresh, or that of its last checkpoint. The World that it reads is kept beside it."""
-    read = {} if world is None else {"world": world}
-    key = jax.random.fold_in(root, 2**31 - 1)
-    state = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **read)
-    if world is not None and not (run.path / worlds.WORLD).exists():
-        save_world(world, run.path / worlds.WORLD)
-    if run.checkpoints():
-        state = state | run.load_checkpoint(learned(state))[1]
-    return state
-
-
 @jax.jit  # one program, and not one for each shape
 def _stacked(*states: PyTree) -> PyTree:
     """States of several seeds as one, with a leading axis."""
@@ -414,11 +412,6 @@ def _stacked(*states: PyTree) -> PyTree:
 def learned(state: PyTree) -> PyTree:
     """What a checkpoint holds: all but what is read of the World, which stands beside it."""
     return {k: v for k, v in state.items() if k != "world"}
-
-
-def _deleted(state: PyTree) -> bool:
-    """An interruption inside a compiled call leaves donated buffers behind; there is nothing to save then."""
-    return any(x.is_deleted() for x in jax.tree.leaves(state))
 
 
 def folder_of(out: str | Path, job: Job, seed: int) -> Path:
@@ -448,15 +441,6 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore, card: dict[str, 
         if job.task.env is None:  # rows of a benchmark's data are made with its references
             write_json(run.path / LOGS, data.outcomes)
         write_json(run.path / "config.json", mine)
-
-
-def _trim_metrics(run: Run, step: int) -> None:
-    """Drop log lines past the checkpoint that training resumes from."""
-    rows = [r for r in run.metrics if r["step"] <= step]
-    file = run.path / "metrics.jsonl"
-    if file.exists():
-        with whole(file) as temporary:
-            temporary.write_text("".join(json.dumps(r) + "\n" for r in rows))
 
 
 def _summary_writer():

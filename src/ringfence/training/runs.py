@@ -122,7 +122,8 @@ class Run:
         for line in lines:
             with suppress(ValueError):
                 row = schemas.decode(line, schemas.Row)
-                rows.append({name: value for name, value in row.items() if _can_be_drawn(value)})
+                numbers = {k: x for k, x in row.items() if isinstance(x, int | float) and not isinstance(x, bool)}
+                rows.append({name: x for name, x in numbers.items() if abs(x) <= LARGEST})
         return rows
 
     def checkpoints(self) -> list[tuple[int, Path]]:
@@ -187,11 +188,6 @@ def runs_below(folder: Path) -> list[Run]:
         return [Run(folder)]
     files = sorted(folder.rglob("config.json")) if folder.is_dir() else []
     return [Run(f.parent) for f in files if not any(p.startswith(".") for p in f.relative_to(folder).parts)]
-
-
-def _can_be_drawn(value: object) -> bool:
-    """Whether a value is a number of a size that an axis can have."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:

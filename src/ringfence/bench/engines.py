@@ -1,30 +1,46 @@
-"""The local engine: worker processes with cores, threads and memory of their own.
+"""Who makes cells: worker processes with cores, threads and memory of their own, or Ray on more machines than one.
 
-A worker that dies takes one attempt of its cell with it and is replaced; a cell that fails twice that way is recorded
-and left. One runner owns a results folder at a time.
+A worker takes groups of cells as JSON lines, makes them, and tells what happened as JSON lines. One that dies takes one
+attempt of its cell with it and is replaced; a cell that fails twice that way is recorded and left. It leaves when its
+pipe closes or its parent is gone, so that a killed runner leaves nobody writing behind. One runner owns a results
+folder at a time.
+
+Ray needs no shared file system: a task makes its data where it runs, goes on in a temporary folder from what the
+driver's holds of its cell, and returns the run folder; the driver puts it in place whole. Ray repeats a task whose
+worker or node died.
 """
 
 from __future__ import annotations
 
+import gc
+import io
 import json
+import logging
 import os
 import queue
+import shutil
+import socket
 import subprocess
 import sys
+import tarfile
+import tempfile
 import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from types import ModuleType
+from typing import IO, Any
 
-from ringfence.bench.cells import Cell, Grid, record_failure, tell_lost
-from ringfence.bench.worker import decode, encode
+import jax
+
+from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group, tell_lost
 from ringfence.errors import UserError
 from ringfence.utils import interrupts
 from ringfence.utils.files import owned
 from ringfence.utils.progress import Progress
 
 DEATHS = 2  # of workers on one cell, after which it is left
+RETRIES = 3
 
 
 def slots_of(cores: list[int], workers: int, threads: int) -> list[list[int]]:
@@ -126,7 +142,7 @@ class _Pool:
         environment["XLA_FLAGS"] = flags.strip()
         environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(self.grid.out.resolve() / "compiled"))
         worker = subprocess.Popen(
-            [sys.executable, "-c", "from ringfence.bench.worker import main; main()"],
+            [sys.executable, "-c", "from ringfence.bench.engines import main; main()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -220,3 +236,179 @@ def resident(pid: int) -> float:
     except (OSError, IndexError, ValueError):
         return 0.0
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
+
+
+# --- a worker ---
+
+
+def encode(cell: Cell) -> dict[str, Any]:
+    return dict(vars(cell))
+
+
+def decode(message: dict[str, Any]) -> Cell:
+    pairs = {name: tuple(tuple(pair) for pair in message[name]) for name in ("changes", "evaluations", "trials")}
+    return Cell(**{**message, **pairs})
+
+
+def leave_with(parent: int) -> None:
+    """End this process once its parent is another one than it was."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def forget() -> None:
+    """Let go of compiled programs: the next job's are others, and kept they grow a worker by 80 MiB a small job."""
+    jax.clear_caches()
+    gc.collect()
+
+
+def main() -> None:
+    leave_with(os.getppid())
+    wire = sys.stdout
+    sys.stdout = sys.stderr  # prints of libraries must not mix with the messages
+
+    def say(**message: Any) -> None:
+        print(json.dumps(message), file=wire, flush=True)
+
+    interrupts.listen()
+    say(event="ready")
+    for line in sys.stdin:
+        job = json.loads(line)
+        out = Path(job["out"])
+        try:
+            if "reference" in job:
+                make_reference(job["reference"], out, job["episodes"], job["transitions"])
+            else:
+                group = [decode(c) for c in job["cells"]]
+                run_group(group, out, job["episodes"], lambda event, cell: say(event=event, cell=encode(cell)))
+            say(event="finished")
+        except KeyboardInterrupt:
+            return
+        except Exception as error:
+            say(event="broken", error=f"{type(error).__name__}: {error}")
+        forget()
+
+
+# --- Ray ---
+
+
+def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: bool = False) -> dict[str, int]:
+    """Make all unfinished cells on a Ray cluster (`auto`, host:port or ray://host:port; None starts a local one)."""
+    if threads < 1:
+        raise UserError(f"threads={threads} must be at least 1.")
+    ray = connect(address)
+    make = packed
+    grid.open()
+
+    @ray.remote(num_cpus=threads, max_retries=RETRIES)
+    def make_cell(cell: Cell, episodes: int, begun: bytes) -> bytes:
+        return make(cell, episodes, begun)
+
+    with owned(grid.out, grid.taken):
+        for name, transitions in grid.references().items():
+            try:
+                make_reference(name, grid.out, grid.episodes, transitions)
+            except Exception as error:  # cells do not need them
+                tell_lost(f"the reference rows of {name}", f"{type(error).__name__}: {error}")
+        cells = [c for group in grid.groups() for c in group]
+        ours = set(cells)
+        later = {
+            c.paired(): c for c in cells if c.paired() in ours
+        }  # they take what their paired cells will have learned
+
+        def submit(cell: Cell) -> Any:
+            return make_cell.remote(cell, grid.episodes, begun(cell, grid.out))
+
+        waiting = {submit(c): c for c in cells if c.paired() not in ours}
+        with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
+            while waiting:
+                (ready,), _ = ray.wait(list(waiting), num_returns=1)
+                cell = waiting.pop(ready)
+                try:
+                    unpack(ray.get(ready), cell.folder(grid.out))
+                except ray.exceptions.RayError as error:
+                    record_failure(cell, grid.out, f"{type(error).__name__}: {str(error).splitlines()[0]}", str(error))
+                if other := later.pop(cell, None):
+                    waiting[submit(other)] = other
+                bar.advance(1)
+    return grid.count()
+
+
+def connect(address: str | None) -> ModuleType:
+    """The ray module, connected; in one sentence why not."""
+    try:
+        import ray
+    except ImportError:
+        raise UserError("The Ray engine needs an extra package; run pip install 'ringfence[ray]'.") from None
+    if ray.is_initialized():
+        return ray
+    try:
+        knock(address)
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"No Ray cluster answers at address '{address}' ({str(error).splitlines()[0]}); start one with `ray start "
+            "--head` or leave --address out."
+        ) from None
+    return ray
+
+
+def knock(address: str | None, seconds: float = 5.0) -> None:
+    """Fail at once where nobody listens; Ray itself would try for minutes."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=seconds).close()
+
+
+def begun(cell: Cell, out: Path) -> bytes:
+    """What `out` holds of a cell and of its paired cell, as a tar file."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+        for known in (cell, cell.paired()):
+            if known is not None and found(known.folder(out)):
+                tar.add(known.folder(out), arcname=str(known.folder(out).relative_to(out)))
+    return buffer.getvalue()
+
+
+def found(folder: Path) -> bool:
+    """Whether a run folder is there; one that was moved aside when its successor was to take its place is put back."""
+    aside = _beside(folder, "old")
+    if aside.exists() and not folder.exists():
+        aside.replace(folder)
+    return folder.exists()
+
+
+def _beside(folder: Path, ending: str) -> Path:
+    return folder.with_name(f".{folder.name}.{ending}")
+
+
+def packed(cell: Cell, episodes: int, begun: bytes) -> bytes:
+    """Make a cell in a temporary folder, from what was begun, and return its run folder as a tar file."""
+    with tempfile.TemporaryDirectory() as place:
+        with tarfile.open(fileobj=io.BytesIO(begun)) as tar:
+            tar.extractall(place, filter="data")
+        run_group([cell], Path(place), episodes, lambda event, cell: None)
+        buffer = io.BytesIO()
+        with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+            tar.add(cell.folder(Path(place)), arcname=".")
+        return buffer.getvalue()
+
+
+def unpack(packed: bytes, folder: Path) -> None:
+    """Put a returned run folder in place, whole or not at all."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = _beside(folder, "part")
+    old = _beside(folder, "old")
+    for left in (part, old):
+        shutil.rmtree(left, ignore_errors=True)
+    with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
+        tar.extractall(part, filter="data")
+    if folder.exists():
+        folder.replace(old)
+    part.replace(folder)
+    shutil.rmtree(old, ignore_errors=True)

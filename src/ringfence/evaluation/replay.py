@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,11 @@ from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, known, of_kind, whole_number
 from ringfence.evaluation.compensation import compensated
-from ringfence.evaluation.replay.drivers import DRIVERS
-from ringfence.evaluation.replay.motion import kinematics_of
-from ringfence.evaluation.replay.result import Film, ReplayResult, Row
-from ringfence.evaluation.replay.scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
-from ringfence.evaluation.replay.stage import Driven, Stage
-from ringfence.evaluation.rollout import FORESEEN
+from ringfence.evaluation.protocol import FORESEEN
+from ringfence.evaluation.replay_scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
+from ringfence.evaluation.replay_stage import DRIVERS, Driven, Stage, kinematics_of
+from ringfence.evaluation.replay_stage import KINEMATICS as KINEMATICS
+from ringfence.evaluation.statistics import clopper_pearson
 from ringfence.faults import Faults
 from ringfence.guards import GUARDS, Guard
 from ringfence.guards.policy import Guarded, build
@@ -93,19 +92,26 @@ def replay(
     _check(drivers, guard, windows, steps, seed)
     run = None if policy is None else Run.of(policy)
     logs = Logs.of(store, run)
-    store, names = logs.store, logs.names
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     given: dict[str, Any] = {"barrier": barrier} if barrier else {}
     if world is not None:
         given["world"] = world if isinstance(world, World) else load(world)
     given |= options
-    if compensate:
-        given |= _compensated(run, logs.task, guard, given, anyway, faults)
-    guarded = _guarded(run, logs.task, guard, given, anyway) if guard != "none" else None
-    known_world = guarded.guard.world if guarded is not None else given.get("world")
+    guarded = _guarded(run, logs.task, guard, given, anyway, faults if compensate else None)
+    known_world = given.get("world") if guarded is None else guarded.guard.world
     how = Body(kinematics, wheelbase, radius, steps, every_episode)
     stage, source, left_out = logs.stage(known_world, how, windows, seed, faults)
-    filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
+    notes = _notes(logs, guarded, faults, compensate)
+    filters = _filters(guard, guarded, known_world if baselines else None, stage, notes)
+    own: dict[str, str | Policy] = {} if run is None else {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy}
+    shown = _played(stage, own | {name: name for name in drivers}, filters, baselines, quiet)
+    about = {"task": logs.store.card.task, "radius_from": source, "begun_in_contact": left_out, "notes": tuple(notes)}
+    return _result(stage, shown, guard, known_world, **about)
+
+
+def _notes(logs: Logs, guarded: Guarded | None, faults: Faults, compensate: bool) -> list[str]:
+    """What is to be known of the rows, a sentence or two each."""
+    store, names = logs.store, logs.names
     notes: list[str] = []
     if faults.given:
         known_to = ", which the guard knows" if compensate else ""
@@ -123,25 +129,37 @@ def replay(
     if names.as_logged:
         kept = ", ".join(names.as_logged[:SHOWN]) + (", ..." if len(names.as_logged) > SHOWN else "")
         notes.append(f"Of a driven agent {kept} stay as logged: no name says how they follow from its motion.")
-    if baselines and known_world is not None:
-        formula = _formula(known_world, stage.radius, stage.windows.dt)
-        filters |= {"formula": formula} if formula else {}
-        notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
-    shown = _played(stage, _players(run, drivers), filters, baselines, quiet)
+    return notes
+
+
+def _filters(
+    guard: str, guarded: Guarded | None, world: World | None, stage: Stage, notes: list[str]
+) -> dict[str, Guarded]:
+    """What filters actions, by name: the guard, and a shield that knows the distance, along 2 s; without that, a note,
+    where the World's view does not hold places of others."""
+    filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
+    if world is None:
+        return filters
+    hazard = constraints.Separation(stage.radius, 0.25 * stage.radius)
+    if constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents) is None:
+        notes.append("The World's view holds no places of others: no row by the formula.")
+        return filters
+    rows = int(np.clip(round(LONG / stage.windows.dt), 3, 20))
+    return filters | {"formula": build(Nothing(), world, hazard, "shield", "analytic", {}, horizon=rows)}
+
+
+def _result(stage: Stage, shown: list[Played], guard: str, world: World | None, **about: Any) -> ReplayResult:
     return ReplayResult(
-        task=store.card.task,
         radius=stage.radius,
-        radius_from=source,
         kinematics=stage.kinematics.name,
         steps=stage.windows.steps,
         seconds=stage.windows.steps * stage.windows.dt,
         windows=stage.windows.count,
-        begun_in_contact=left_out,
         guard=guard,
-        verdict=_verdict(known_world),
+        verdict=None if world is None or world.card.verdict is None else world.card.verdict.word,
         rows=tuple(row for one in shown for row in rows_of(stage, one)),
-        notes=tuple(notes),
         films=tuple(film for one in shown if guard in one.under for film in [_film(stage, one, guard)])[:FILMS],
+        **about,
     )
 
 
@@ -183,9 +201,22 @@ class Logs:
             check_view(world, self.store)
         motion = motion_of(self.store, self.names)
         radius, source = radius_of(self.store, motion, how.radius, {} if world is None else world.card.causes)
-        stage, left_out = _stage(self.store, self.names, motion, world, how, radius, windows, seed)
-        late = dataclasses.replace(faults, delay=faults.delay + self.store.card.action_delay)  # as whoever was logged
-        return dataclasses.replace(stage, faults=late), source, left_out
+        card = self.store.card
+        if card.dt is None:
+            raise UserError(f"The card of '{card.task}' does not say how long a step takes; give it dt (s).")
+        dt = float(card.dt)
+        chosen = np.arange(self.store.episodes) if how.every_episode else _unlearned(world, self.store)
+        longest = int(np.median(self.store.lengths[chosen]))
+        if how.steps is None and round(SECONDS / dt) < 2:
+            raise UserError(
+                f"A step of '{card.task}' is {dt:g} s, and a window has {SECONDS:g} s; say how many steps it has "
+                "(--steps, steps=)."
+            )
+        steps = how.steps or max(1, min(round(SECONDS / dt), longest))
+        cut, left_out = windows_of(self.store, self.names, motion, chosen, steps, windows, radius, dt)
+        body = kinematics_of(how.kinematics, self.store, motion, world, dt, how.wheelbase)
+        late = dataclasses.replace(faults, delay=faults.delay + card.action_delay)  # as whoever was logged
+        return Stage(cut, body, radius, seed, late), source, left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,12 +226,6 @@ class Played:
     name: str
     plain: Driven
     under: dict[str, Driven]
-
-
-def _players(run: Run | None, drivers: Sequence[str]) -> dict[str, str | Policy]:
-    """Who drives, by name: the run first."""
-    bad: dict[str, str | Policy] = {name: name for name in drivers}
-    return bad if run is None else {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy} | bad
 
 
 def _played(
@@ -222,34 +247,32 @@ def _played(
     return shown
 
 
-def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool) -> Guarded:
-    """The run under guard, or a guard of whatever is proposed."""
+def _guarded(
+    run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool, known: Faults | None = None
+) -> Guarded | None:
+    """The run under guard, or a guard of whatever is proposed; it knows of the faults that are `known`. None where
+    nobody guards."""
+    if known is not None:
+
+        def guard_of(spec: PolicySpec) -> Guard:
+            found = _guarded(run, task, guard, options, anyway)
+            assert found is not None, "compensation without a guard is refused first"
+            return found.guard
+
+        choices = options | {"guard": guard, "anyway": anyway}
+        found = compensated(run, known, choices, guard_of)
+        options = options | {name: value for name, value in found.items() if name not in choices}
+    if guard == "none":
+        return None
     if run is not None:
-        found = resolve(PolicySpec.of(run, guard=guard, anyway=anyway, **options)).policy
-        assert isinstance(found, Guarded), "a guard was named"
-        return found
+        policy = resolve(PolicySpec.of(run, guard=guard, anyway=anyway, **options)).policy
+        assert isinstance(policy, Guarded), "a guard was named"
+        return policy
     spec = PolicySpec.of(guard=guard, anyway=anyway, **options)
     if not isinstance(spec.world, World):
         raise UserError("Nothing says which World guards; give world=, e.g. ringfence.fit(store), or a run.")
     changes = dict(spec.guard_options)
     return build(Nothing(), spec.world, task.hazard, guard, spec.barrier, anyway=anyway, **changes)
-
-
-def _compensated(
-    run: Run | None, task: Task, guard: str, given: dict[str, Any], anyway: bool, faults: Faults
-) -> dict[str, Any]:
-    """Options of a guard that knows of faults, beside those that it is given."""
-
-    def guard_of(spec: PolicySpec) -> Guard:
-        return _guarded(run, task, guard, given, anyway).guard
-
-    choices = given | {"guard": guard, "anyway": anyway}
-    found = compensated(run, faults, choices, guard_of)
-    return {name: value for name, value in found.items() if name not in choices}
-
-
-def _verdict(world: World | None) -> str | None:
-    return None if world is None or world.card.verdict is None else world.card.verdict.word
 
 
 def _check(drivers: Sequence[str], guard: str, windows: int, steps: int | None, seed: int) -> None:
@@ -305,33 +328,6 @@ def check_view(world: World, store: EpisodeStore) -> None:
         raise UserError(
             f"The World steps by {world.map.dt:g} s, these logs by {store.card.dt:g} s; import them with that dt."
         )
-
-
-def _stage(
-    store: EpisodeStore,
-    names: Names,
-    motion: Motion,
-    world: World | None,
-    how: Body,
-    radius: float,
-    most: int,
-    seed: int,
-) -> tuple[Stage, int]:
-    """The stage, and how many windows begin in contact."""
-    if store.card.dt is None:
-        raise UserError(f"The card of '{store.card.task}' does not say how long a step takes; give it dt (s).")
-    dt = float(store.card.dt)
-    chosen = np.arange(store.episodes) if how.every_episode else _unlearned(world, store)
-    longest = int(np.median(store.lengths[chosen]))
-    if how.steps is None and round(SECONDS / dt) < 2:
-        raise UserError(
-            f"A step of '{store.card.task}' is {dt:g} s, and a window has {SECONDS:g} s; say how many steps it has "
-            "(--steps, steps=)."
-        )
-    steps = how.steps or max(1, min(round(SECONDS / dt), longest))
-    cut, left_out = windows_of(store, names, motion, chosen, steps, most, radius, dt)
-    body = kinematics_of(how.kinematics, store, motion, world, dt, how.wheelbase)
-    return Stage(cut, body, radius, seed), left_out
 
 
 def _unlearned(world: World | None, store: EpisodeStore) -> np.ndarray:
@@ -409,21 +405,18 @@ def _radius_of_causes(causes: Mapping[str, Found], axes: int) -> tuple[float, st
     return radius, f"the World's cause '{name}'; other dangers are not counted"
 
 
-def _formula(world: World, radius: float, dt: float) -> Guarded | None:
-    """A shield that knows the distance, along 2 s; None where the World's view does not hold places of others."""
-    hazard = constraints.Separation(radius, 0.25 * radius)
-    if constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents) is None:
-        return None
-    rows = int(np.clip(round(LONG / dt), 3, 20))
-    return build(Nothing(), world, hazard, "shield", "analytic", {}, horizon=rows)
-
-
 def rows_of(stage: Stage, played: Played) -> list[Row]:
     logged = int((stage.windows.nearest_logged[:, 1:] < stage.radius).any(-1).sum())
     plain = played.plain.contact
+    driven = stage.windows.driven
     made = []
     for filter, found in {"none": played.plain, **played.under}.items():
         clearance = found.info.get("clearance")
+        by_agent = []
+        for agent in np.unique(driven):
+            own = driven == agent
+            info = {name: float(value[own].mean()) for name, value in found.info.items() if name != FORESEEN}
+            by_agent.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **info})
         made.append(
             Row(
                 policy=played.name,
@@ -437,7 +430,7 @@ def rows_of(stage: Stage, played: Played) -> list[Row]:
                 infeasible=_share(found, "infeasible"),
                 ood=_share(found, "ood"),
                 margin=None if clearance is None else float(np.median(clearance)),
-                by_agent=_by_agent(stage.windows.driven, found),
+                by_agent=tuple(by_agent),
             )
         )
     return made
@@ -445,16 +438,6 @@ def rows_of(stage: Stage, played: Played) -> list[Row]:
 
 def _share(found: Driven, name: str) -> float | None:
     return float(found.info[name].mean()) if name in found.info else None
-
-
-def _by_agent(driven: np.ndarray, found: Driven) -> tuple[dict[str, Any], ...]:
-    """What the guard says while each agent is driven."""
-    made = []
-    for agent in np.unique(driven):
-        own = driven == agent
-        info = {name: float(value[own].mean()) for name, value in found.info.items() if name != FORESEEN}
-        made.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **info})
-    return tuple(made)
 
 
 def _film(stage: Stage, played: Played, guard: str) -> Film:
@@ -472,3 +455,96 @@ def _film(stage: Stage, played: Played, guard: str) -> Film:
         alone=plain.place[k],
         guarded=guarded.place[k],
     )
+
+
+@dataclass(frozen=True)
+class Row:
+    """A policy under one filter. Counts are of windows; intervals are exact, at 95 %."""
+
+    policy: str
+    filter: str  # none, brake, formula, or the guard's name
+    windows: int
+    logged: int  # with contact as logged
+    alone: int  # with contact of the same policy without a filter
+    contacts: int
+    prevented: int
+    caused: int
+    infeasible: float | None = None  # share of steps in which the guard cannot do what it should
+    ood: float | None = None  # and in which it is out of distribution
+    margin: float | None = None  # median of the guard's margin
+    by_agent: tuple[dict[str, Any], ...] = ()  # the same of each driven agent
+
+    @property
+    def contacts_interval(self) -> tuple[float, float]:
+        low, high = clopper_pearson(self.contacts, self.windows)
+        return low, high
+
+    @property
+    def caused_interval(self) -> tuple[float, float]:
+        low, high = clopper_pearson(self.caused, self.windows)
+        return low, high
+
+    @property
+    def prevented_interval(self) -> tuple[float, float] | None:
+        """Of the contacts without a filter; None where there are none."""
+        if not self.alone:
+            return None
+        low, high = clopper_pearson(self.prevented, self.alone)
+        return low, high
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """One window: places in metres."""
+
+    title: str
+    others: np.ndarray  # (L+1, K, X) along X axes
+    logged: np.ndarray  # (L+1, X)
+    alone: np.ndarray  # (L+1, X) the policy without guard
+    guarded: np.ndarray  # (L+1, X)
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """Rows by policy and filter, all of the same windows."""
+
+    task: str
+    radius: float  # m
+    radius_from: str
+    kinematics: str
+    steps: int
+    seconds: float
+    windows: int
+    begun_in_contact: int  # windows left out
+    guard: str
+    verdict: str | None  # of the World
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+    films: tuple[Film, ...] = field(default=(), repr=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the films, with intervals, as files hold it."""
+        made = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("rows", "films")}
+        intervals = ("contacts_interval", "prevented_interval", "caused_interval")
+        made["rows"] = [asdict(row) | {name: getattr(row, name) for name in intervals} for row in self.rows]
+        return made
+
+    def row(self, policy: str, filter: str) -> Row:
+        return next(row for row in self.rows if (row.policy, row.filter) == (policy, filter))
+
+    def summary(self) -> list[str]:
+        """Lines for a terminal."""
+        first = self.rows[0]
+        lines = [
+            f"{self.task}: {self.windows} windows of {self.seconds:.3g} s, contact below {self.radius:.3g} m "
+            f"({self.radius_from}), kinematics {self.kinematics}; as logged {first.logged} with contact",
+            f"{'policy':12} {'filter':10} {'contacts':>8} {'prevented':>16} {'caused':>7}  of windows (95 %)",
+        ]
+        for row in self.rows:
+            share = f"{row.prevented} of {row.alone}" if row.filter != "none" else "–"
+            low, high = row.contacts_interval
+            lines.append(
+                f"{row.policy:12} {row.filter:10} {row.contacts:8} {share:>16} {row.caused:7}  "
+                f"contacts {100 * row.contacts / row.windows:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+            )
+        return [*lines, *self.notes]

@@ -175,13 +175,6 @@ class Windows:
         faster = velocity - self.velocity[:, t]
         x = np.array(self.observations[:, t], np.float64)
         mine = x[self.rows, self.driven]
-        self._own(mine, moved, faster, velocity, heading)
-        self._others(mine, moved, faster)
-        x[self.rows, self.driven] = mine
-        self._as_others_see(t, x, moved, faster)
-        return x.astype(np.float32), self._whole(t, moved, faster)
-
-    def _own(self, mine, moved, faster, velocity, heading) -> None:
         changes = [("own.{}", moved), ("own.v{}", faster)]
         for thing in self.names.things:  # that move or stand still as they did
             changes += [(f"{thing}.d{{}}", -moved), (f"{thing}.dv{{}}", -faster)]
@@ -195,6 +188,10 @@ class Windows:
             mine[:, own[what]] = known[what]
         if len(looks := self.names.entries.direction) == 2:
             mine[:, looks] = np.stack([np.cos(heading), np.sin(heading)], -1)
+        self._others(mine, moved, faster)
+        x[self.rows, self.driven] = mine
+        self._as_others_see(t, x, moved, faster)
+        return x.astype(np.float32), self._whole(t, moved, faster)
 
     def _others(self, mine, moved, faster) -> None:
         """What the driven agent sees of others; those who are not there stay where nobody is."""
@@ -206,18 +203,15 @@ class Windows:
             if pair := self.names.pair(f"other{j}.dv{{}}"):
                 mine[:, pair] -= faster * seen
         if self.sorted and self.names.slots > 1:
-            self._sort(mine)
-
-    def _sort(self, mine: np.ndarray) -> None:
-        others = self.names.entries.others[: self.names.slots]
-        whats = list(others[0])
-        entries = np.array([[other[what] for what in whats] for other in others])
-        blocks = mine[:, entries]  # (W, K, C)
-        far = np.linalg.norm(blocks[..., [whats.index(f"d{axis}") for axis in self.names.axes]], axis=-1)
-        if "seen" in whats:
-            far = np.where(blocks[..., whats.index("seen")] > 0.5, far, NOBODY)
-        order = np.argsort(far, -1, kind="stable")
-        mine[:, entries] = np.take_along_axis(blocks, order[..., None], 1)
+            others = self.names.entries.others[: self.names.slots]
+            whats = list(others[0])
+            entries = np.array([[other[what] for what in whats] for other in others])
+            blocks = mine[:, entries]  # (W, K, C)
+            far = np.linalg.norm(blocks[..., [whats.index(f"d{axis}") for axis in self.names.axes]], axis=-1)
+            if "seen" in whats:
+                far = np.where(blocks[..., whats.index("seen")] > 0.5, far, NOBODY)
+            order = np.argsort(far, -1, kind="stable")
+            mine[:, entries] = np.take_along_axis(blocks, order[..., None], 1)
 
     def _as_others_see(self, t: int, x, moved, faster) -> None:
         """What others see of the driven agent, in teams in which everybody sees everybody."""

@@ -128,11 +128,29 @@ class OPEResult:
 
     def summary(self) -> list[str]:
         """Lines for a person."""
-        lines = [self._headline(), *self._values_lines()]
+        lines = [self._headline()]
+        for name in ("return", "cost"):
+            line = f"{name}, discounted by {self.discount:g}: {getattr(self.values, name + 's')}"
+            if self.values_of_logs is not None:
+                line += f"; the logs {getattr(self.values_of_logs, name + 's')}"
+            lines.append(line)
         if self.rollout is not None:
-            lines.append(_of_rollout(self.rollout))
+            played = self.rollout
+            line = (
+                f"played for {played.steps} steps in the World of these logs: return {played.returns.mean:.4g} "
+                f"({played.returns.low:.4g} to {played.returns.high:.4g}; the logs {played.returns_of_logs:.4g})"
+            )
+            if (unsafe := played.unsafe_steps) is not None:
+                line += f", {unsafe.mean:.3g} dangerous steps (the logs {played.unsafe_steps_of_logs:.3g})"
+            lines.append(line + f"; it does not know {_percent(played.ood_rate)} of the way")
         if self.safety is not None:
-            lines.append(_of_safety(self.safety, self.ahead))
+            safety = self.safety
+            lines.append(
+                f"danger is predicted within {self.ahead} steps from {_percent(safety.predicted_violation_rate)} of "
+                f"the safe states (the logs: {_percent(safety.predicted_violation_rate_of_logs)}); "
+                f"{_percent(safety.margin_violation_rate)} do not keep the calibrated margin (the logs: "
+                f"{_percent(safety.margin_violation_rate_of_logs)})"
+            )
         done = self.behaviour
         if done.intervention_rate is not None:
             lines.append(
@@ -152,34 +170,6 @@ class OPEResult:
         if self.episodes_trained_on in (None, self.logs.episodes):
             return line + " that it was trained on: the best case"
         return line + f", of which it was trained on {self.episodes_trained_on:,}: leave these out"
-
-    def _values_lines(self) -> list[str]:
-        lines = []
-        for name in ("return", "cost"):
-            line = f"{name}, discounted by {self.discount:g}: {getattr(self.values, name + 's')}"
-            if self.values_of_logs is not None:
-                line += f"; the logs {getattr(self.values_of_logs, name + 's')}"
-            lines.append(line)
-        return lines
-
-
-def _of_rollout(played: ModelRollout) -> str:
-    line = (
-        f"played for {played.steps} steps in the World of these logs: return {played.returns.mean:.4g} "
-        f"({played.returns.low:.4g} to {played.returns.high:.4g}; the logs {played.returns_of_logs:.4g})"
-    )
-    if played.unsafe_steps is not None:
-        line += f", {played.unsafe_steps.mean:.3g} dangerous steps (the logs {played.unsafe_steps_of_logs:.3g})"
-    return line + f"; it does not know {_percent(played.ood_rate)} of the way"
-
-
-def _of_safety(safety: Safety, ahead: int) -> str:
-    return (
-        f"danger is predicted within {ahead} steps from {_percent(safety.predicted_violation_rate)} of the safe "
-        f"states (the logs: {_percent(safety.predicted_violation_rate_of_logs)}); "
-        f"{_percent(safety.margin_violation_rate)} do not keep the calibrated margin (the logs: "
-        f"{_percent(safety.margin_violation_rate_of_logs)})"
-    )
 
 
 def _percent(share: float | None) -> str:

@@ -1,16 +1,28 @@
-"""How a run is to be played, as flags that several commands share."""
+"""What commands share: flags of how a run is played, how logs are replayed and what goes wrong in a closed loop; and
+what is said to a person."""
 
 from __future__ import annotations
 
 import dataclasses
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+from rich.console import Console
+from rich.markup import escape
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, plain
+from ringfence.faults import Chance, Faults
 
+if TYPE_CHECKING:
+    from ringfence.training.runs import Run
+
+WIDE = 1000  # columns of what is no terminal: nothing is cut that another program, or a file, is to read
 # --set a=1 b=2 and --set a=1 --set b=2 mean the same.
 Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
 
@@ -93,3 +105,78 @@ def assignments(given: list[list[str]]) -> dict[str, str]:
             raise UserError(f"--set gives {name} twice, {changes[name]} and {value}; give one of them.")
         changes[name] = value
     return changes
+
+
+@dataclass(frozen=True)
+class Replaying:
+    """Windows of logs in which one agent is driven; docs/replay.md says how."""
+
+    kinematics: Literal["double_integrator", "holonomic", "unicycle", "bicycle", "world"] | None = None
+    """how the driven agent moves; by default a double integrator where that explains the logs, else the World's."""
+    wheelbase: float = 2.7
+    """m, of a bicycle."""
+    radius: float | None = None
+    """m between two agents below which they touch; by default the task's formula, else as costs tell it, else the
+    World's causes."""
+    steps: int | None = None
+    """of a window; 8 s by default."""
+    every_episode: bool = False
+    """replay the episodes that the World learned from, too."""
+
+    def arguments(self) -> dict[str, Any]:
+        """The same as arguments of `replay` and `certify`."""
+        return dataclasses.asdict(self)
+
+
+AS_LOGGED = Replaying()
+Replayed = Annotated[tyro.conf.OmitArgPrefixes[Replaying], tyro.conf.arg(name="replays")]
+
+
+@dataclass(frozen=True)
+class FaultFlags(Faults):
+    """What goes wrong; docs/certificates.md says what each does."""
+
+    asynchrony: Annotated[Chance, tyro.conf.arg(name="async")] = 0.0
+    """share of steps that an agent lets pass, each in its own rhythm."""
+
+    def __post_init__(self):
+        """Refuse nothing yet: a refusal in the parser would be no sentence."""
+
+    def faults(self) -> Faults:
+        """The same as a value; refused before any run is played."""
+        return Faults.of(dataclasses.asdict(self))
+
+
+NO_FAULTS = FaultFlags()
+Wrong = Annotated[tyro.conf.OmitArgPrefixes[FaultFlags], tyro.conf.arg(name="faults")]
+
+
+def console() -> Console:
+    """Of stdout, as wide as its terminal."""
+    terminal = sys.stdout is not None and sys.stdout.isatty()  # None: it was closed
+    return Console(highlight=False, width=None if terminal else WIDE)
+
+
+def complain(message: str) -> None:
+    """Say on stderr what is wrong."""
+    Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+def plain_warnings() -> None:
+    """Have warnings say what they say, and not where in the code."""
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {plain(str(message))}\n"
+
+
+@dataclass
+class Refusals:
+    """Why runs were refused, so that what several are refused for is said once."""
+
+    runs: dict[str, list[Run]] = field(default_factory=dict)  # by message
+
+    @contextmanager
+    def of(self, run: Run) -> Iterator[None]:
+        """Note down a refusal of this run and go on."""
+        try:
+            yield
+        except UserError as error:
+            self.runs.setdefault(str(error), []).append(run)
