@@ -34,7 +34,7 @@ from typing import IO, Any
 import jax
 
 from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group, tell_lost
-from ringfence.errors import UserError
+from ringfence.errors import UserError, needs
 from ringfence.utils import interrupts
 from ringfence.utils.files import owned
 from ringfence.utils.progress import Progress
@@ -341,10 +341,8 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
 
 def connect(address: str | None) -> ModuleType:
     """The ray module, connected; in one sentence why not."""
-    try:
+    with needs("ray", "Benchmarks on a cluster"):
         import ray
-    except ImportError:
-        raise UserError("The Ray engine needs an extra package; run pip install 'ringfence[ray]'.") from None
     if ray.is_initialized():
         return ray
     try:

@@ -454,7 +454,7 @@ def export(
     Args:
         run: a run folder.
         out_file: the file to write.
-        format: onnx, for onnxruntime and the like, needs the extra `ringfence[export]`; stablehlo needs nothing.
+        format: onnx, for onnxruntime and the like, or stablehlo; both need the extra `ringfence[export]`.
         checkpoint: step of the one that is written; the last one by default.
     """
     given = playing.arguments()

@@ -36,7 +36,7 @@ from jax.extend import core
 
 from ringfence import __version__
 from ringfence.deploy.jaxpr import Interpreter, bind, draws, live, operations, value, values_of
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, needs, unknown
 from ringfence.evaluation.certificate import digest
 from ringfence.guards import Guarded
 from ringfence.loading.resolve import Resolved, resolve
@@ -73,7 +73,7 @@ def export(
     **options: Any,
 ) -> Path:
     """Write the policy of a finished run to the file `out`: `onnx`, for onnxruntime and the like, needs the extra
-    `ringfence[export]`; `stablehlo` needs nothing. Options are those of `evaluate.load`; what a format cannot hold is
+    `ringfence[export]`, as `stablehlo` does. Options are those of `evaluate.load`; what a format cannot hold is
     refused, and nothing is written."""
     if format not in FORMATS:
         raise unknown("format", str(format), FORMATS)
@@ -294,24 +294,19 @@ def _swept(graph: Any) -> set[str]:
 
 def _packer() -> Any:
     """`jax.export`, which packs programs with flatbuffers, a package that JAX does not ask for itself."""
-    try:
+    with needs("export", "StableHLO files"):
         import flatbuffers  # noqa: F401
         from jax import export as jax_export
-    except ImportError:
-        raise UserError("StableHLO is packed by flatbuffers, which is missing; run pip install flatbuffers.") from None
     return jax_export
 
 
 def _converter() -> tuple[Callable, Callable]:
     """What converts to ONNX, and what checks the result."""
     as_it_was = jnp.cumsum  # which jax2onnx replaces for good, by one that takes no axis by its place
-    try:
+    with needs("export", "ONNX files"):
         from jax2onnx import to_onnx
         from onnx.checker import check_model
-
-        jnp.cumsum = as_it_was
-    except ImportError:
-        raise UserError("ONNX is written by jax2onnx, which is missing; run pip install 'ringfence[export]'.") from None
+    jnp.cumsum = as_it_was
     return to_onnx, check_model
 
 

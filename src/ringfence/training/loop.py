@@ -23,7 +23,7 @@ import numpy as np
 
 from ringfence import algos
 from ringfence.datasets import registry
-from ringfence.errors import CheckpointError, RunConflict, UserError, of_kind, unknown, whole_number
+from ringfence.errors import CheckpointError, RunConflict, UserError, needs, of_kind, unknown, whole_number
 from ringfence.logs.resolution import require_resolved
 from ringfence.logs.schema import other_data
 from ringfence.logs.store import EpisodeStore
@@ -70,7 +70,7 @@ def train(
     A folder that exists is resumed from its last checkpoint if it holds the same job, and refused otherwise.
     `vmap_seeds` trains all seeds in one program (same results up to rounding; faster only where the networks are too
     small to fill the machine). `chunk` is the number of updates between log lines, a fortieth of all by default;
-    `world` changes settings of the World that training reads (world/fitting.py `Settings`), if it reads one.
+    `world` changes settings of the World that training reads (world/settings.py `Settings`), if it reads one.
     `on_chunk` and `on_finish` are called after each of them and with each finished run. `folder` names the run folder
     of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
@@ -444,8 +444,6 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore, card: dict[str, 
 
 
 def _summary_writer():
-    try:
+    with needs("tensorboard", "TensorBoard logs"):
         from tensorboardX import SummaryWriter
-    except ImportError:
-        raise UserError("TensorBoard logs need an extra package; run pip install 'ringfence[tensorboard]'.") from None
     return SummaryWriter
