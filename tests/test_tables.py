@@ -343,10 +343,16 @@ def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
         else np.stack([store.observations[(2 * 3 + i) * 12 + 5, 0] for i in range(3)])
     )
     np.testing.assert_allclose(seen, logged, atol=2e-5)
-    with pytest.raises(UserError, match="The logs observe 'own.vx'"):
+    with pytest.raises(UserError, match="own.vx', .*; add vx to state: what x changed by since the row before"):
         observe(store.card, {c: now[c] for c in ("x", "y", "vy")}, {"x": now["gx"], "y": now["gy"]})
     with pytest.raises(UserError, match="give one number per agent"):
         observe(store.card, {"x": now["x"][:2], "y": now["y"]})
+
+
+def test_velocities_that_a_table_lacks_are_named():
+    store = EpisodeStore.from_table(fleet(), **(NAMES | {"state": ["x", "y", "vy"]}))
+    assert "vx: what x changed by since the row before; observe() is to be given these" in store.card.warnings
+    assert not any("observe()" in note for note in EpisodeStore.from_table(fleet(), **NAMES).card.warnings)
 
 
 def test_a_schema_says_what_its_options_say():

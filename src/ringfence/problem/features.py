@@ -30,6 +30,7 @@ from ringfence.types import Array, X
 View = Literal["pruned", "centralized", "decentralized"]
 Source = Literal["state", "observations"]
 VIEWS = ("pruned", "centralized", "decentralized")
+LESS = " less "  # between what an entry is made of, one taken from another
 _TABLES = ("plus", "minus", "origin", "order")  # fields of a map that are arrays
 STEPS = 4000  # or rows, that are looked at
 ROWS = 10_000  # of a column that are looked at together
@@ -173,7 +174,7 @@ def given_names(map: FeatureMap, entries: Sequence[str], state: Sequence[str] | 
         given += [f"{entry} of agent {i}" for i in range(map.plus.shape[0]) for entry in entries]
     given += [f"state{d}" for d in range(len(state or ()), map.width)]
     both = zip(map.plus[0].tolist(), map.minus[0].tolist())
-    return [given[one] if less < 0 else f"{given[one]} less {given[less]}" for one, less in both]
+    return [given[one] if less < 0 else f"{given[one]}{LESS}{given[less]}" for one, less in both]
 
 
 def others_offsets(names: Sequence[str]) -> np.ndarray:

@@ -111,11 +111,14 @@ class Parts(Progress):
         self.seconds: dict[str, float] = {}  # that parts took, by name
         self.finished = 0.0  # expected seconds of what is done
         self.now, self.of_now, self.share = "", 0.0, 0.0
+        self.stages: list[str] = []  # of the part that is worked at, by their labels
+        self.several = 1
 
     @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """While it is open, that part is worked at."""
+    def part(self, name: str, several: int = 1) -> Iterator[None]:
+        """While it is open, that part is worked at, which has so many stages."""
         self.now, self.of_now, self.share = name, self.skip(name), 0.0
+        self.stages, self.several = [], several
         began = time.monotonic()
         try:
             yield
@@ -133,7 +136,10 @@ class Parts(Progress):
         return 0.0 if found is None else self.expected.pop(found)[1]
 
     def within(self, label: str, share: float) -> None:
-        self.share = share
+        if label not in self.stages:
+            self.stages.append(label)
+        done = len(self.stages) - 1 + share
+        self.share = max(self.share, done / max(self.several, len(self.stages)))
         self._show()
 
     def _show(self, at_once: bool = False) -> None:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import msgspec
 
 from ringfence.errors import plain
+from ringfence.problem.features import LESS
 from ringfence.utils.config import build_config
 from ringfence.utils.text import percent, significant
 from ringfence.world.causes import Cause, Edge, Found
@@ -279,8 +280,11 @@ def _of_data(card: Card) -> Iterator[str]:
     inferred = card.data.inferred_names or {}
     if named := [f"{name} ({entry})" for entry, name in inferred.items() if UNNAMED.match(entry)]:
         yield f"Logs tell what these entries are, which nobody named: {', '.join(named)}."
-    if read := [f"{name} ({entry})" for entry, name in inferred.items() if not UNNAMED.match(entry)]:
+    given = {entry: name for entry, name in inferred.items() if not UNNAMED.match(entry)}
+    if read := [f"{name} ({entry})" for entry, name in given.items() if LESS not in entry]:
         yield f"Logs tell what these entries are, which are read by other names than given: {', '.join(read)}."
+    if apart := dict.fromkeys(name.rpartition(".")[2] for entry, name in given.items() if LESS in entry):
+        yield f"What others' entries are is read less what one's own are, too: {', '.join(apart)}."
     if card.data.partners:
         yield "Who is in lists of the nearest is found by what two see of each other; predictions read what these do."
     if card.data.impacts:

@@ -109,7 +109,7 @@ class Fit:
         if self.cached and (kept := _read(file, template)) is not None:
             self.bar.skip(name)
             return kept
-        with self.bar.part(name):
+        with self.bar.part(name, several=2 if name == "values" else 1):  # the critic, and what steps are worth
             made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
         if self.cached:
             save_named(file, named_arrays(made), {"key": file.stem})

@@ -311,6 +311,10 @@ def _made_of(schema: TableSchema) -> Iterator[str]:
         yield (
             "rewards are the progress to the goal, in m" if schema.goal else "no reward was given: it is 0 everywhere"
         )
+    made = [axis for axis in schema.axes if f"v{axis}" not in schema.velocity]
+    if made:
+        velocities = ", ".join(f"v{axis}" for axis in made)
+        yield f"{velocities}: what {', '.join(made)} changed by since the row before; observe() is to be given these"
     if not schema.action:
         yield "actions are accelerations, differences of velocities"
 

@@ -194,7 +194,7 @@ def _columns(schema: TableSchema) -> None:
     if schema.goal and len(schema.goal) != len(schema.position):
         raise UserError(
             f"goal names {len(schema.goal)} columns, the position has {len(schema.position)}; state must hold as many "
-            "of x, y, z, under these names."
+            "of x, y, z, under these names (rename)."
         )
     if (schema.homogeneous or schema.danger is not None) and not schema.position:
         raise UserError("state holds no x, y or z, which neighbours and distances follow from; rename these columns.")
