@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ringfence.datasets.audit import read_as
 from ringfence.evaluation.replay_scene import motion_of, names_of, windows_of
 from ringfence.guards.shown import _going
 from ringfence.logs.store import EpisodeStore
@@ -103,3 +104,14 @@ def test_vehicles_in_lane_coordinates_are_replayed_and_their_entries_follow():
     np.testing.assert_allclose(mine[:, :2], logged[:, :2] + moved, atol=1e-5)
     np.testing.assert_allclose(mine[:, 5:7], logged[:, 5:7] - moved, atol=1e-5)
     np.testing.assert_allclose(mine[:, 4], 0.3, atol=1e-6)
+
+
+def test_what_names_say_is_shown():
+    """`ringfence data info` shows what was read of each name."""
+    names = ["own.x", "own.y", "own.yaw", "goal.dx", "goal.dy", "other0.dx", "other0.dy", "other1.dx", "other1.dy", "obs9"]
+    assert read_as(names) == (
+        "oneself: place x y, heading yaw; goal: from one's own place dx dy; "
+        "each of 2 other: from one's own place dx dy; 1 whose names say nothing"
+    )
+    assert read_as(["own.gap", "right.gap"]) == "oneself: number gap; right: number gap"
+    assert read_as([]) == "no names"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from ringfence.logs.late import late_actions
 from ringfence.logs.resolution import coarse
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.problem.entries import Entries, Entry
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import local_features
 from ringfence.types import has_entry
@@ -26,6 +27,14 @@ NEAR = 0.75  # how alike two names are, of difflib's ratio: `othr0` and `other0`
 LONGEST = 60  # letters of a name that are
 MOST = 200  # names that are compared: each with each
 DIGITS = "0123456789"
+FIELDS = 12  # names, and bodies, that a line lists
+ROLES = {
+    "place": "place",
+    "velocity": "velocity",
+    "offset": "from one's own place",
+    "drift": "velocity less one's own",
+    "number": "number",
+}
 TWINS = {"x": "y", "y": "x"}  # the last letter of what is told along each axis
 
 
@@ -41,7 +50,8 @@ class Audit(NamedTuple):
 
 def audit(store: EpisodeStore) -> Audit:
     """Sizes, returns, cost, share of episodes that start unsafe, and warnings in plain words."""
-    facts = _sizes(store) | _outcomes(store) | _speeds(store)
+    facts = _sizes(store) | {"entries are read as": read_as(store.card.observation_names or ())}
+    facts |= _outcomes(store) | _speeds(store)
     try:
         task = registry.from_store(store)
     except UserError as error:
@@ -73,6 +83,28 @@ def odd_names(store: EpisodeStore) -> list[str]:
     """Warnings of names that look misspelt."""
     card = store.card
     return [*slips(card.observation_names or ()), *slips(card.state_names or ())]
+
+
+def read_as(names: Sequence[str]) -> str:
+    """What the names of observations' entries say: of whom each is, and in which role (docs/import.md)."""
+    entries = Entries.of(names)
+    bodies: dict[str, dict[str, list[Entry]]] = {}
+    for entry in entries.each:
+        fields = bodies.setdefault(entry.whose, {}).setdefault(entry.what, [])
+        fields.append(entry)
+    found = []
+    for whose, fields in bodies.items():
+        roles: dict[str, list[str]] = {}
+        for what, of_each in fields.items():
+            heading = whose == "own" and of_each[0].source in entries.direction
+            roles.setdefault("heading" if heading else ROLES[of_each[0].role], []).append(what)
+        count = len({entry.order for of_each in fields.values() for entry in of_each})
+        who = {"own": "oneself"}.get(whose, whose) if count == 1 else f"each of {count} {whose}"
+        found.append(f"{who}: " + ", ".join(f"{role} {' '.join(each[:FIELDS])}" for role, each in roles.items()))
+    unread = len(names) - len(entries.each)
+    if unread or not names:
+        found.append(f"{unread} whose names say nothing" if names else "no names")
+    return "; ".join(found[:FIELDS])
 
 
 def _unread(store: EpisodeStore, task: Task) -> list[str]:
