@@ -108,7 +108,8 @@ def test_vehicles_in_lane_coordinates_are_replayed_and_their_entries_follow():
 
 def test_what_names_say_is_shown():
     """`ringfence data info` shows what was read of each name."""
-    names = ["own.x", "own.y", "own.yaw", "goal.dx", "goal.dy", "other0.dx", "other0.dy", "other1.dx", "other1.dy", "obs9"]
+    names = ["own.x", "own.y", "own.yaw", "goal.dx", "goal.dy", *(f"other{k}.d{axis}" for k in (0, 1) for axis in "xy")]
+    names += ["obs9"]
     assert read_as(names) == (
         "oneself: place x y, heading yaw; goal: from one's own place dx dy; "
         "each of 2 other: from one's own place dx dy; 1 whose names say nothing"

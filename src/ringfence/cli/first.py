@@ -34,18 +34,23 @@ def doctor() -> None:
         out.print(f"{name:12} {version}")
     out.print(f"{'devices':12} {escape(_devices(versions['devices']))}", soft_wrap=True)
     out.print(f"{'cache':12} {escape(str(cache_dir()))}", soft_wrap=True)
-    from ringfence.report import video
-
     try:
+        from ringfence.report import video
+
         out.print(f"{'films':12} drawn by {video.backend()}")
     except UserError as error:
         out.print(f"{'films':12} [yellow]missing[/], {escape(str(error))}", soft_wrap=True)
     for package, extra, use in (
+        ("matplotlib", "report", "pages, figures and films"),
+        ("mujoco", "sim", "robots"),
+        ("pettingzoo", "sim", "PettingZoo's simulators"),
+        ("pyarrow", "tables", "CSV and Parquet"),
+        ("rosbags", "ros", "ROS bags"),
         ("tensorboardX", "tensorboard", "TensorBoard logs"),
         ("tensorstore", "vault", "OG-MARL's Vaults"),
         ("minari", "minari", "Minari's data sets by their names"),
         ("ray", "ray", "benchmarks on a cluster"),
-        ("jax2onnx", "export", "policies as ONNX files"),
+        ("jax2onnx", "export", "policies as files"),
         ("mpe2", "test", "parity tests"),
     ):
         try:
