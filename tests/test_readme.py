@@ -80,7 +80,7 @@ def test_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
     """In examples/, block after block; the World, the policy and the logs are small."""
     fit, train = ringfence.fit, ringfence.train
     small = {"num_updates": 4, "width": 16}
-    monkeypatch.setattr(ringfence, "fit", lambda store: fit(store, **QUICK_WORLD), raising=False)
+    monkeypatch.setattr(ringfence, "fit", lambda store, quiet=True: fit(store, **QUICK_WORLD), raising=False)
     monkeypatch.setattr(ringfence, "train", lambda *a: train(*a, changes=small, quiet=True), raising=False)
     monkeypatch.setitem(GUARDS, "shield", {"correction_steps": 1, "horizon": 1})
     monkeypatch.setitem(algos.ALGORITHMS, "mine", None)  # a page adds one
