@@ -1,5 +1,5 @@
 """The cheapest rivals of a return-conditioned planner: cloning the best episodes (`bc-best`), and an
-actor that reads the return it is to reach (`bc-return`; Emmons et al. 2022, "RvS", whose outcomes are ours: scores.py).
+actor that reads the return it is to reach (`bc-return`; Emmons et al. 2022, "RvS", whose outcomes are ours).
 
 `bc-return` sees what the planner sees and is conditioned on the same return, at the same discount and target: what
 differs is that it answers with one action and no plan.

@@ -85,24 +85,7 @@ def collect(
     shape = Shape(state=None if _has_state(env, seed) else 0, double=True)
     simulators = SideBySide([env], shape, max_episode_steps, early_ends, cost, lambda seen, state: np.zeros(len(seen)))
     keeper = _Keeper(env, space.bounds, source, card, file, kept, _skipped(kept))
-    simulator = source["simulator"]
-    begun = _begun(kept)
-    with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
-        try:
-            for k in range(begun, episodes):
-                with interrupts.held(k > begun):
-                    keeper.add(_played(simulators, player, space, seed, k))
-                if k == 0 and "hazard" not in (card or {}):
-                    _warn_unless_charged(simulator, keeper.fresh)
-                bar.advance(1)
-        except KeyboardInterrupt as stopped:
-            keeper.keep()
-            raise Interrupted(keeper.said(episodes), keeper.kept) from stopped
-        finally:  # a refusal costs no episode that was finished
-            keeper.keep()
-    if keeper.kept is None:
-        raise UserError(f"All {episodes} episodes of {simulator} were skipped: agents leave each; cut them.")
-    return keeper.kept
+    return keeper.filled(episodes, lambda k: _played(simulators, player, space, seed, k), quiet)
 
 
 @dataclass(eq=False)
@@ -126,6 +109,27 @@ class _Keeper:
             self.fresh.append(played)
         if self.file is not None and len(self.fresh) == EACH:
             self.keep()
+
+    def filled(self, episodes: int, play: Callable[[int], _Played | None], quiet: bool) -> EpisodeStore:
+        """The store of so many episodes, of which those that are not there are played."""
+        simulator = self.source["simulator"]
+        begun = _begun(self.kept)
+        with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
+            try:
+                for k in range(begun, episodes):
+                    with interrupts.held(k > begun):
+                        self.add(play(k))
+                    if k == 0 and "hazard" not in (self.card or {}):
+                        _warn_unless_charged(simulator, self.fresh)
+                    bar.advance(1)
+            except KeyboardInterrupt as stopped:
+                self.keep()
+                raise Interrupted(self.said(episodes), self.kept) from stopped
+            finally:  # a refusal costs no episode that was finished
+                self.keep()
+        if self.kept is None:
+            raise UserError(f"All {episodes} episodes of {simulator} were skipped: agents leave each; cut them.")
+        return self.kept
 
     def keep(self) -> None:
         """Join and write what is fresh."""

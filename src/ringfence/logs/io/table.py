@@ -452,7 +452,7 @@ def _read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str], for
             column = schema.wide.replace(COLUMN, theirs.get(name, name)).replace(AGENT, lacking[0])
             raise StoreError(
                 f"The agent '{lacking[0]}' has no column '{column}', and "
-                f" '{next(iter(columns))}' has; leave {name} out, or add it."
+                f"'{next(iter(columns))}' has; leave {name} out, or add it."
             )
     everybodys = {name: theirs.get(name, name) for name in (*shared, *(name for name in asked if not own[name]))}
     read = read_columns(
