@@ -154,20 +154,6 @@ def robots_kept(variant: str, wanted: int, suite: str = ROBOTS) -> Check:
     return check
 
 
-@on(f"guards, {ROBOTS}")
-def same_safety() -> tuple[bool, str]:
-    """Learned danger beside the formula, under cloning: Simple Spread's shield and the robots' adapting one."""
-    share, left = [], []
-    for task in tasks_of("guards"):
-        learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS)
-        share.append(learned / formula)
-        left.append(mean("guards", task, ("bc", "default+shield-learned"), "cost_safe_start"))
-    kept = [limits(ROBOTS, "bc", f"default+adapt-{d}") for d in BARRIERS]
-    text = f"at least {100 * min(share):.1f} % of the return on every tier, at most {max(left):.3f} cost left; robots' "
-    text += f"limits kept {kept[0]} and {kept[1]} of 18"
-    return min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1], text
-
-
 def clone_earns(task: str, guard: str) -> float:
     """A clone's return on a robot under a guard of learned danger, over all seeds."""
     return mean(ROBOTS, task, variant(task, ("bc", f"default+{guard}-learned")), "return_mean")
@@ -909,7 +895,6 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "On Simple Spread a shield takes the cost from every proposal": shielded_all,
         "The return comes from climbing learned values": CLIMBING_EARNS,
         "A zero proposal (`mpc`) earns less on three": CLONING_EARNS,
-        "learned danger does what the formula does": same_safety,
         "A shield of each agent's own leaves hardly a collision step": own_shield_leaves_little,
         # robots
         "intervals included, by learned danger and by the formula": robots_kept("default+adapt-learned", 17),
