@@ -247,12 +247,20 @@ from ringfence.cli import app
 from ringfence.envs import SafeMuJoCo
 for name in set(ringfence.__all__) - {"build_report"}:
     getattr(ringfence, name)
+from ringfence.report import board, export_board, table, video
 for use in (lambda: ringfence.build_report, lambda: SafeMuJoCo("2x4").model()):
     try:
         use()
     except ringfence.UserError as error:
         print(error)
+for words in (["ope", "a", "b"], ["replay", "a", "b"], ["bench", "results", "a"], ["fit", "a", "--report", "b.html"]):
+    try:
+        app.main(words)
+    except SystemExit:
+        pass
 """
-    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    assert "Pages, figures and films need jinja2, which is missing; run pip install 'ringfence[report]'." in said
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    said = found.stdout
+    assert found.stderr.count("is missing") == 1, "of the page that was asked for"
+    assert "Pages, figures and films need matplotlib, which is missing; run pip install 'ringfence[report]'." in said
     assert "Robots need gymnasium, which is missing; run pip install 'ringfence[sim]'." in said

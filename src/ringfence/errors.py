@@ -127,14 +127,17 @@ def reason(error: BaseException) -> str:
 
 @contextmanager
 def needs(extra: str, use: str) -> Iterator[None]:
-    """Import packages that the core goes without: one that is missing becomes a refusal that says how to get it."""
+    """Import packages that the core goes without: one that is missing, or does not load, becomes a refusal that says
+    how to get it."""
     try:
         yield
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         package = str(error.name).partition(".")[0]
         if package == __package__:
             raise
-        raise UserError(f"{use} need {package}, which is missing; run pip install 'ringfence[{extra}]'.") from None
+        missing = isinstance(error, ModuleNotFoundError)
+        why = f"{package}, which is missing" if missing else f"what does not load here ({reason(error)})"
+        raise UserError(f"{use} need {why}; run pip install 'ringfence[{extra}]'.") from error
 
 
 @contextmanager

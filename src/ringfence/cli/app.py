@@ -30,6 +30,7 @@ from ringfence.cli.shared import (
     assignments,
     complain,
     console,
+    page_at,
     plain_warnings,
 )
 from ringfence.errors import Interrupted, UserError, one_of, whole_number
@@ -146,7 +147,7 @@ def fit(
     from ringfence.datasets import registry
     from ringfence.training import worlds
 
-    report = None if report is None else writable(report)
+    report = page_at(report)
     out_file = None if out_file is None else writable(out_file)
     settings: dict[str, Any] = dict(assignments(set))
     store = None
@@ -166,7 +167,7 @@ def fit(
         print(world.save(made, out_file))
     if report is not None and store is not None:
         from ringfence.datasets.audit import audit
-        from ringfence.report.logs_pages import build_ope
+        from ringfence.report import build_ope
 
         print(build_ope(report, made.card, audit(store)))
     if made.card.verdict is not None and made.card.verdict.word == "unfit":
@@ -489,11 +490,10 @@ def ope(
     from ringfence.datasets.audit import audit
     from ringfence.evaluation import ope as evaluation
     from ringfence.loading.spec import PolicySpec
-    from ringfence.report.logs_pages import build_ope
     from ringfence.training import worlds
 
     given = playing.arguments()
-    report = None if report is None else writable(report)
+    report = page_at(report)
     found = _one_run(run)
     sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
     evaluation.check_sizes(**sizes)
@@ -502,6 +502,8 @@ def ope(
     for line in result.summary():
         out.print(lines(line), soft_wrap=True)
     if report is not None:
+        from ringfence.report import build_ope
+
         execution = PolicySpec.of(found, **given).execution
         evaluated_by = worlds.fit(store, seed=seed + 1, execution=execution)  # the one that did, from the cache
         print(build_ope(report, evaluated_by.card, audit(store), result))
@@ -532,13 +534,12 @@ def replay(
         compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.replay import replay as replayed
-    from ringfence.report.logs_pages import build_replay
     from ringfence.training.runs import write_json
     from ringfence.training.worlds import with_world
 
     given: dict[str, Any] = {**playing.arguments(), "faults": wrong.faults(), "compensate": compensate}
     out_file = None if out_file is None else writable(out_file)
-    report = None if report is None else writable(report)
+    report = page_at(report)
     policy = None if run.is_file() else _one_run(run)
     if policy is None:
         given["world"] = playing.world or run
@@ -550,6 +551,8 @@ def replay(
         write_json(out_file, result.to_json())
         print(out_file)
     if report is not None:
+        from ringfence.report import build_replay
+
         print(build_replay(report, result))
 
 

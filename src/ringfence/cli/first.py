@@ -50,7 +50,8 @@ def doctor() -> None:
         ("tensorstore", "vault", "OG-MARL's Vaults"),
         ("minari", "minari", "Minari's data sets by their names"),
         ("ray", "ray", "benchmarks on a cluster"),
-        ("jax2onnx", "export", "policies as files"),
+        ("jax2onnx", "export", "policies as ONNX files"),
+        ("flatbuffers", "export", "policies as StableHLO files"),
         ("mpe2", "test", "parity tests"),
     ):
         try:

@@ -18,6 +18,7 @@ from rich.markup import escape
 
 from ringfence.errors import UserError, plain
 from ringfence.faults import Chance, Faults
+from ringfence.utils.files import writable
 
 if TYPE_CHECKING:
     from ringfence.training.runs import Run
@@ -149,6 +150,16 @@ class FaultFlags(Faults):
 
 NO_FAULTS = FaultFlags()
 Wrong = Annotated[tyro.conf.OmitArgPrefixes[FaultFlags], tyro.conf.arg(name="faults")]
+
+
+def page_at(report: Path | None) -> Path | None:
+    """Where a page is to be written: refused before any work where none can be, or where nothing here draws one."""
+    if report is None:
+        return None
+    from ringfence import report as pages
+
+    pages.build_report  # noqa: B018 (loads what draws)
+    return writable(report)
 
 
 def console() -> Console:

@@ -1,6 +1,6 @@
 """A trained policy, guard included, as one file that needs neither Python nor this library.
 
-The function in the file is one joint action of `evaluate.Controller`, of one environment, in float32:
+The function in the file is one joint action of `deploy.Controller`, of one environment, in float32:
 
     observations (N, O), state (S,), cost (), noise.K, memory.NAME  ->  action (N, A), info.NAME (), next.NAME
 
@@ -72,9 +72,9 @@ def export(
     quiet: bool = True,
     **options: Any,
 ) -> Path:
-    """Write the policy of a finished run to the file `out`: `onnx`, for onnxruntime and the like, needs the extra
-    `ringfence[export]`, as `stablehlo` does. Options are those of `evaluate.load`; what a format cannot hold is
-    refused, and nothing is written."""
+    """Write the policy of a finished run to the file `out`: `onnx`, for onnxruntime and the like, or
+    `stablehlo`; both need the extra `ringfence[export]`. Options are those of `ringfence.load`; what a format cannot
+    hold is refused, and nothing is written."""
     if format not in FORMATS:
         raise unknown("format", str(format), FORMATS)
     file = writable(out)
@@ -458,15 +458,14 @@ def _trace(job: Job, policy: Policy) -> _Traced:
         raise UserError(
             "This run does not tell how wide its observations and state are, and a file has to; train it again."
         )
-    num_constraints = len(constraints_of(policy))
+    constraints = constraints_of(policy)
     shapes: dict[str, tuple[int, ...]] = {"observations": (job.team, width)}
     if state_width:
         shapes["state"] = (state_width,)
-    shapes["cost"] = (num_constraints,) if num_constraints else ()
+    shapes["cost"] = (len(constraints),) if constraints else ()
     seen = {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in shapes.items()}
     carry = policy.initial_state(1)
     leaves, structure = jax.tree.flatten(carry)
-    constraints = constraints_of(policy)
 
     def act(key: Key, seen_arrays: Sequence[Array], leaves: Sequence[Array]) -> tuple[dict[str, Array], list[Array]]:
         read = dict(zip(seen, seen_arrays))

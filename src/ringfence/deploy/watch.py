@@ -26,14 +26,14 @@ from ringfence.utils.given import given_as
 from ringfence.utils.pytrees import digest_of
 
 SEEN = ("observations", "state")
-FEW = 1e-6  # an executed action that differs by less from the requested one is that
+SAME = 1e-6  # an executed action that differs by less from the requested one is that
 ON_ALARM = ("report", "stop", "widen", "hand_over")
 WIDER = 1.5  # times the margin
 
 Fallback = Callable[[np.ndarray, np.ndarray | None], Any]  # observations (N, O), state (S,) or None -> actions (N, A)
 SLACK = 1e-3  # s by which a stamp may be ahead of the clock: clocks of two machines differ
 LATELY = 20  # decisions whose time is remembered
-TOO_FEW = 3  # of them, before which nothing is added: the first one compiles
+ENOUGH = 3  # of them, before which nothing is added: the first one compiles
 
 
 class Evidence:
@@ -102,7 +102,7 @@ class Evidence:
             # Of each agent whose action is another than it requested: that one, and the worst along its plan.
             requested = info["agent_requested"]
             found = []
-            for agent in np.flatnonzero((np.abs(requested - action) > FEW).any(-1)).tolist():
+            for agent in np.flatnonzero((np.abs(requested - action) > SAME).any(-1)).tolist():
                 constraint, thing = self._parts[int(info["agent_reason"][agent])]
                 found.append(
                     {
@@ -255,7 +255,7 @@ class Stamps:
                 "clock of an observer runs backwards, or messages overtook one another: keep the newest."
             )
         self._now, self._last = now, stamps
-        lately = float(np.median(self._took)) if len(self._took) >= TOO_FEW else 0.0
+        lately = float(np.median(self._took)) if len(self._took) >= ENOUGH else 0.0
         return np.floor(np.maximum(now + lately - stamps, 0.0) / dt + 0.5).astype(np.int64)
 
     def acted(self) -> None:

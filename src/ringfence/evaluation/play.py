@@ -8,7 +8,7 @@ import importlib.util
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -25,7 +25,7 @@ from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
 from ringfence.evaluation.player import HasPolicy, Player, RunPlayer, player_of
 from ringfence.evaluation.protocol import COUNTED, RESETS, Acting
-from ringfence.evaluation.recordings import Places, Recording, filled, recording, watching
+from ringfence.evaluation.recordings import Places, filled, recording, watching
 from ringfence.faults import Faults
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.entries import Names
@@ -92,7 +92,7 @@ def play(
     if keep and isinstance(player, RunPlayer):
         how = {"split": split, "simulator": name_of(make_env, env.envs[0])}
         how |= {"num_envs": num_envs, "early_ends": early_ends}
-        _keep(player, episodes, summary | about, how, recording(watches, played))
+        _keep(player, episodes, summary | about, how, watches, played)
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}
     return shown | about | {"cost_limit": player.task.cost_limit}
 
@@ -165,13 +165,21 @@ def _names_of(player: Player, env: Any) -> Names:
     return Names.of(player.observation_names, states or (), len(env.possible_agents))
 
 
-def _keep(player: RunPlayer, episodes: int, result: dict[str, Any], how: dict[str, Any], film: Recording) -> None:
+def _keep(
+    player: RunPlayer,
+    episodes: int,
+    result: dict[str, Any],
+    how: dict[str, Any],
+    watches: Sequence[Places],
+    played: Sequence[Episode],
+) -> None:
     """Add a result to the run, with the command that makes it again, and the film beside it."""
     words = ["--env", how["simulator"], "--episodes", episodes, "--num-envs", how["num_envs"]]
     words += [] if how["early_ends"] == "refuse" else ["--early-ends", how["early_ends"]]
     words += [*split_words(how["split"]), *player.spec.words]
     of_file = how | {"command": ["play", *map(str, words)], "protocol": protocol.PROTOCOL, "variant": player.variant}
     player.run.add_result(player.variant, result | of_file)
+    film = recording(watches, played)
     recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))
 
 

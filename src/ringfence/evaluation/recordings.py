@@ -122,7 +122,7 @@ def watching(names: Names, count: int) -> tuple[list[Places], Callable[[], Watch
 
 
 def recording(watches: Sequence[Places], episodes: Sequence[Episode]) -> Recording:
-    """What is kept of the first of these episodes (recordings.py); nothing where nobody watched."""
+    """What is kept of the first of these episodes; nothing where nobody watched."""
     seen = [(np.stack(w.rows, 1)[r], w.resting[r]) for w in watches for r in range(len(w.rows[0]))]
     kept = [(rows, resting, e) for (rows, resting), e in zip(seen, episodes) if e.over and not e.skipped][:EPISODES]
     if not kept:

@@ -97,7 +97,8 @@ def replay(
     if world is not None:
         given["world"] = world if isinstance(world, World) else load(world)
     given |= options
-    guarded = _guarded(run, logs.task, guard, given, anyway, faults if compensate else None)
+    knowing = _knowing(run, logs.task, guard, given, anyway, faults) if compensate else given
+    guarded = _guarded(run, logs.task, guard, knowing, anyway)
     known_world = given.get("world") if guarded is None else guarded.guard.world
     how = Body(kinematics, wheelbase, radius, steps, every_episode)
     stage, source, left_out = logs.stage(known_world, how, windows, seed, faults)
@@ -135,8 +136,8 @@ def _notes(logs: Logs, guarded: Guarded | None, faults: Faults, compensate: bool
 def _filters(
     guard: str, guarded: Guarded | None, world: World | None, stage: Stage, notes: list[str]
 ) -> dict[str, Guarded]:
-    """What filters actions, by name: the guard, and a shield that knows the distance, along 2 s; without that, a note,
-    where the World's view does not hold places of others."""
+    """What filters actions, by name: the guard, and a shield that knows the distance, along 2 s. Where the World's view
+    does not hold places of others there is none of these, and a note says so."""
     filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
     if world is None:
         return filters
@@ -247,21 +248,23 @@ def _played(
     return shown
 
 
-def _guarded(
-    run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool, known: Faults | None = None
-) -> Guarded | None:
-    """The run under guard, or a guard of whatever is proposed; it knows of the faults that are `known`. None where
-    nobody guards."""
-    if known is not None:
+def _knowing(
+    run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool, faults: Faults
+) -> dict[str, Any]:
+    """The options, with those by which the guard makes good for faults that it knows of."""
 
-        def guard_of(spec: PolicySpec) -> Guard:
-            found = _guarded(run, task, guard, options, anyway)
-            assert found is not None, "compensation without a guard is refused first"
-            return found.guard
+    def guard_of(spec: PolicySpec) -> Guard:
+        found = _guarded(run, task, guard, options, anyway)
+        assert found is not None, "compensation without a guard is refused first"
+        return found.guard
 
-        choices = options | {"guard": guard, "anyway": anyway}
-        found = compensated(run, known, choices, guard_of)
-        options = options | {name: value for name, value in found.items() if name not in choices}
+    choices = options | {"guard": guard, "anyway": anyway}
+    found = compensated(run, faults, choices, guard_of)
+    return options | {name: value for name, value in found.items() if name not in choices}
+
+
+def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool) -> Guarded | None:
+    """The run under guard, or a guard of whatever is proposed. None where nobody guards."""
     if guard == "none":
         return None
     if run is not None:

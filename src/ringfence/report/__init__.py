@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
+
 from ringfence.errors import needs
 
-with needs("report", "Pages, figures and films"):
-    import jinja2  # noqa: F401
-    import matplotlib  # noqa: F401
-    import PIL  # noqa: F401
+# Loaded on first use: what is no page needs none of the packages that draw.
+_WHERE = {
+    "board_csv": "export",
+    "board_latex": "export",
+    "board_markdown": "export",
+    "board_markdown_short": "export",
+    "build_board": "board_page",
+    "build_ope": "logs_pages",
+    "build_replay": "logs_pages",
+    "build_report": "page",
+    "export_board": "export",
+}
+__all__ = list(_WHERE)
 
-from ringfence.report.board_page import build_board
-from ringfence.report.export import board_csv, board_latex, board_markdown, board_markdown_short, export_board
-from ringfence.report.page import build_report
 
-__all__ = [
-    "board_csv",
-    "board_latex",
-    "board_markdown",
-    "board_markdown_short",
-    "build_board",
-    "build_report",
-    "export_board",
-]
+def __getattr__(name: str):
+    if name not in _WHERE:
+        raise AttributeError(f"module 'ringfence.report' has no attribute '{name}'")
+    with needs("report", "Pages, figures and films"):
+        return getattr(importlib.import_module(f"ringfence.report.{_WHERE[name]}"), name)

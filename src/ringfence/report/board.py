@@ -397,3 +397,54 @@ def _band(shares: np.ndarray) -> np.ndarray | None:
 def _pairs(scores: dict[Method, np.ndarray], methods: list[Method]) -> np.ndarray:
     """(M, M) probability that a run of the row scores higher than one of the column, averaged over tasks."""
     return np.array([[statistics.probability_of_improvement(scores[a], scores[b]) for b in methods] for a in methods])
+
+
+def short(task: str, suite: str) -> str:
+    """`simple_spread-expert` -> `expert` on a board of simple_spread."""
+    return task.removeprefix(f"{suite}-") or task
+
+
+# --- ranking ---
+
+
+@dataclass(frozen=True)
+class RankingRow:
+    """A method over the tasks of a ranking."""
+
+    line: Line  # of the first task on which it was measured
+    cells: list[Line | None]  # per task
+    mean: float | None  # of its ranks; None where a task is missing
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Methods by their mean rank over the tasks that follow one protocol."""
+
+    protocol: str  # empty where a board has one kind of tasks
+    tasks: list[str]
+    rows: list[RankingRow]
+
+
+def rankings(board: Board) -> list[Ranking]:
+    """One per protocol: tasks that share data and policies under two limits are not two tasks."""
+    return [Ranking(p, tasks, _ranks(board, tasks)) for p, tasks in by_protocol(board).items()]
+
+
+def _ranks(board: Board, tasks: list[str]) -> list[RankingRow]:
+    """Mean ranks are counted among the methods that were measured on every task; the others come last, since they have
+    none."""
+    cells = {m: [board.line(t, m) for t in tasks] for m in board.methods}
+    # Of the methods that were measured on every task, among themselves.
+    complete = {m: [cell for cell in row if cell] for m, row in cells.items() if all(row)}
+    places: list[np.ndarray] = []
+    for k, task in enumerate(tasks):
+        measured = [row[k] for row in complete.values()]
+        limit = board.sections[task].constants.get("cost_limit", 0.0)  # a task may have no result yet
+        places.append(statistics.places([r.returns for r in measured], [r.cost_interval[1] for r in measured], limit))
+    means = {m: float(np.mean([place[k] for place in places])) for k, m in enumerate(complete)}
+    rows = [
+        RankingRow(first, row, means.get(method))
+        for method, row in cells.items()
+        if (first := next((cell for cell in row if cell), None))
+    ]
+    return sorted(rows, key=lambda r: (r.mean is None, r.mean or 0.0))

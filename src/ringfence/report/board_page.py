@@ -21,10 +21,18 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ringfence.algos import ALGORITHMS
 from ringfence.datasets import registry
-from ringfence.evaluation import statistics
 from ringfence.evaluation.statistics import Interval
 from ringfence.report import html
-from ringfence.report.board import DRAWS, Aggregate, Board, aggregates, by_protocol, contests, read
+from ringfence.report.board import (
+    DRAWS,
+    Aggregate,
+    Board,
+    aggregates,
+    contests,
+    rankings,
+    read,
+    short,
+)
 from ringfence.report.figures import FAR, INK, Ticks, colour, figure, figure_with_legend, marker, style, to_svg
 from ringfence.report.page import TEMPLATE, of_section
 from ringfence.report.provenance import environments
@@ -76,57 +84,6 @@ def build_board(folder: str | Path, out: str | Path, title: str | None = None) -
         "environments": environments([run for each in board.sections.values() for run in each.runs]),
     }
     return html.write(out, html.render(TEMPLATE, context))
-
-
-def short(task: str, suite: str) -> str:
-    """`simple_spread-expert` -> `expert` on a board of simple_spread."""
-    return task.removeprefix(f"{suite}-") or task
-
-
-# --- ranking ---
-
-
-@dataclass(frozen=True)
-class RankingRow:
-    """A method over the tasks of a ranking."""
-
-    line: Line  # of the first task on which it was measured
-    cells: list[Line | None]  # per task
-    mean: float | None  # of its ranks; None where a task is missing
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """Methods by their mean rank over the tasks that follow one protocol."""
-
-    protocol: str  # empty where a board has one kind of tasks
-    tasks: list[str]
-    rows: list[RankingRow]
-
-
-def rankings(board: Board) -> list[Ranking]:
-    """One per protocol: tasks that share data and policies under two limits are not two tasks."""
-    return [Ranking(p, tasks, _ranks(board, tasks)) for p, tasks in by_protocol(board).items()]
-
-
-def _ranks(board: Board, tasks: list[str]) -> list[RankingRow]:
-    """Mean ranks are counted among the methods that were measured on every task; the others come last, since they have
-    none."""
-    cells = {m: [board.line(t, m) for t in tasks] for m in board.methods}
-    # Of the methods that were measured on every task, among themselves.
-    complete = {m: [cell for cell in row if cell] for m, row in cells.items() if all(row)}
-    places: list[np.ndarray] = []
-    for k, task in enumerate(tasks):
-        measured = [row[k] for row in complete.values()]
-        limit = board.sections[task].constants.get("cost_limit", 0.0)  # a task may have no result yet
-        places.append(statistics.places([r.returns for r in measured], [r.cost_interval[1] for r in measured], limit))
-    means = {m: float(np.mean([place[k] for place in places])) for k, m in enumerate(complete)}
-    rows = [
-        RankingRow(first, row, means.get(method))
-        for method, row in cells.items()
-        if (first := next((cell for cell in row if cell), None))
-    ]
-    return sorted(rows, key=lambda r: (r.mean is None, r.mean or 0.0))
 
 
 # --- sections ---

@@ -10,8 +10,7 @@ from typing import Any
 
 from ringfence.errors import one_of, plain
 from ringfence.report import html
-from ringfence.report.board import Board, read
-from ringfence.report.board_page import rankings, short
+from ringfence.report.board import Board, rankings, read, short
 from ringfence.report.html import share
 from ringfence.report.table import Line, Method
 from ringfence.utils.text import latex, markdown, spreadsheet

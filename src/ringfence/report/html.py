@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import jinja2
-from markupsafe import Markup
-
 from ringfence import __version__
+from ringfence.errors import needs
 from ringfence.utils.files import whole, writable
 from ringfence.utils.text import page
 
@@ -17,6 +15,10 @@ HERE = Path(__file__).parent
 
 def render(template: str, context: dict[str, Any]) -> str:
     """A page from one of the templates beside this file; a name that the context lacks is an error."""
+    with needs("report", "Pages"):
+        import jinja2
+        from markupsafe import Markup
+
     engine = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE),
         autoescape=True,
