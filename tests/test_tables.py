@@ -351,7 +351,7 @@ def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
 
 def test_velocities_that_a_table_lacks_are_named():
     store = EpisodeStore.from_table(fleet(), **(NAMES | {"state": ["x", "y", "vy"]}))
-    assert "vx: what x changed by since the row before; observe() is to be given these" in store.card.warnings
+    assert "vx: what x changed by since the row before, per second; give these to observe()" in store.card.warnings
     assert not any("observe()" in note for note in EpisodeStore.from_table(fleet(), **NAMES).card.warnings)
 
 

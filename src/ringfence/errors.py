@@ -54,6 +54,10 @@ class CheckpointError(UserError):
     """A checkpoint is truncated, foreign or incomplete."""
 
 
+class Missing(UserError, ImportError):
+    """A package that the core goes without is asked for."""
+
+
 class NoWorld(UserError):
     """A run is to be played with a World that is nowhere, and whose data this package can make again. `execution` is
     that of the World."""
@@ -132,12 +136,12 @@ def needs(extra: str, use: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        package = str(error.name).partition(".")[0]
+        package = (error.name or "").partition(".")[0]
         if package == __package__:
             raise
-        missing = isinstance(error, ModuleNotFoundError)
+        missing = isinstance(error, ModuleNotFoundError) and package
         why = f"{package}, which is missing" if missing else f"what does not load here ({reason(error)})"
-        raise UserError(f"{use} need {why}; run pip install 'ringfence[{extra}]'.") from error
+        raise Missing(f"{use} need {why}; run pip install 'ringfence[{extra}]'.") from error
 
 
 @contextmanager

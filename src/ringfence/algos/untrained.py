@@ -1,4 +1,8 @@
-"""What algorithms that learn nothing share: one update that changes nothing makes the run folder."""
+"""Algorithms that learn nothing: one update that changes nothing makes the run folder.
+
+`naive` heads straight for its goal; a guard shows by it what becomes of somebody who never saw the logs. `mpc` proposes
+rest, so that whatever is done a guard finds by climbing value: what a learned proposal is worth it adds to this.
+"""
 
 from __future__ import annotations
 

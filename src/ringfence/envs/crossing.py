@@ -298,8 +298,6 @@ class Crossing(Defaults):
         return goal, _mixed(number[..., 0] + jnp.uint32(77)).astype(jnp.float32)
 
 
-
-
 def length(x: Array) -> Array:
     """Euclidean, with a slope at 0."""
     return jnp.sqrt((x**2).sum(-1) + 1e-12)

@@ -361,6 +361,7 @@ def _number(value: Any, what: str, whose: str) -> float:
     except (TypeError, ValueError):
         raise UserError(f"{whose} tells the {what} {str(value)[:80]!r}, which is no number; give one.") from None
 
+
 @dataclass(eq=False)
 class SideBySide:
     """PettingZoo `ParallelEnv`s, whose `episodes` keep what came of each.

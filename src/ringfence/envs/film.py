@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
+from ringfence.errors import needs
+
 if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
@@ -52,8 +54,10 @@ class Robot(Protocol):
 def robot_frames(env: Robot, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
     """Pictures of an episode, states (T+1, S), at `moments`: (step, whether it is shown as above the limit). The planar
     position is not in the state, so it is summed up from the velocity."""
-    import mujoco
-    from PIL import Image, ImageDraw
+    with needs("sim", "Films of robots"):
+        import mujoco
+    with needs("report", "Films"):
+        from PIL import Image, ImageDraw
 
     mj: Any = mujoco  # its stubs lack what its extension defines
     model = env.model()
@@ -220,7 +224,8 @@ def captioned(
     caption: Callable[[int, int], str],
 ) -> Iterator[Image]:
     """Pictures that `draw` makes of steps, under a line that says how many of the steps (T+1,) bool were bad so far."""
-    from PIL import Image, ImageDraw, ImageFont
+    with needs("report", "Films"):
+        from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(13 * FINE)
     count = 0

@@ -151,6 +151,7 @@ class Layout:
             raise UserError(f"{what} of {agent} has shape {array.shape}, the first agent's begins {first}; mend one.")
         return array
 
+
 def _box() -> type[Box]:
     with needs("sim", "Spaces of padded simulators"):
         from gymnasium.spaces import Box

@@ -183,8 +183,8 @@ def evaluate_policy(
 
 
 class Acting:
-    """A policy as `envs.rollout` plays it: compiled where it can be, and in 32 bits, whatever the precision of the
-    simulator. What JAX cannot take apart acts in its own."""
+    """A policy as `rollout` of `envs/base.py` plays it: compiled where it can be, and in 32 bits, whatever the
+    precision of the simulator. What JAX cannot take apart acts in its own."""
 
     def __init__(self, policy: Policy):
         self.policy = policy

@@ -1,7 +1,7 @@
 """A plan is proved where all that the World predicts of it is safe, from all states that observations allow.
 
 Observations may be off by ε in every entry, and old: others may have accelerated since. From that box of states the
-World's dynamics lead to another, row by row, and the least score in each is bounded from below (`guards/proof.py`). An
+World's dynamics lead to another, row by row, and the least score in each is bounded from below. An
 action is proved if that is 0 or more in every row of a plan that begins with it: some way out is left. This says
 nothing of a World that errs by more than `residual` a row, nor of others who do not keep their velocity meanwhile.
 """
@@ -317,6 +317,12 @@ def _braking(dynamics: Dynamics, motion: Motion, x: Array) -> Array:
     gram = jnp.swapaxes(push, -1, -2) @ push + 1e-6 * jnp.eye(size)
     wanted = -jnp.linalg.solve(gram, jnp.swapaxes(push, -1, -2) @ after[..., None])[..., 0]
     return wanted / jnp.maximum(jnp.abs(wanted).max(-1, keepdims=True), 1.0)
+
+
+# --- what a ReLU network can give for all inputs in a set ---
+# A ReLU whose sign is not known is held between two lines. Bounds of the outputs are then those of a linear function,
+# which is found by going backward through the layers (CROWN, Zhang et al. 2018). What lines a ReLU gets is decided
+# going forward, which is cheaper where layers are wide and inputs few.
 
 
 class Inputs(NamedTuple):

@@ -6,7 +6,7 @@ The planner draws plans and reads the action off the first step of one:
     plan        present    row1  row2  ...   row H-1       in-painted | generated
     executed    f_φ(present, row 1), then plan again (or follow the plan for `replan` steps)
 
-What becomes of several plans, and of what they would do, is a guard's (guard/).
+What becomes of several plans, and of what they would do, is a guard's (guards/).
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ import numpy as np
 from ringfence.datasets.task import Task
 from ringfence.envs.base import Filmed
 from ringfence.envs.film import DRAWN
-from ringfence.errors import UserError
+from ringfence.errors import UserError, needs
 from ringfence.evaluation import recordings
 from ringfence.loading.resolve import load_job
 from ringfence.training.runs import Run
@@ -40,6 +40,8 @@ def backend() -> str:
     wanted = os.environ.get("MUJOCO_GL")
     reasons = []
     trial = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
+    with needs("sim", "Films of robots"):
+        import mujoco  # noqa: F401
     for name in (wanted,) if wanted else BACKENDS.get(sys.platform, ("egl", "osmesa")):
         made = _run([sys.executable, "-c", trial], name)
         if made.returncode == 0:

@@ -1,4 +1,5 @@
-"""Somebody's function that decides: of observations and the state, or of observations alone."""
+"""Somebody's function: whether it decides by observations and the state or by observations alone, and whether it is the
+same as another, by its code and all that this holds."""
 
 from __future__ import annotations
 

@@ -107,8 +107,6 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, An
     return path
 
 
-
-
 def natural(name: str) -> tuple[list[str | tuple[int, str]], str]:
     """What to sort names by: numbers in them by their value, the rest as text."""
     parts: list[str | tuple[int, str]] = [*_DIGITS.split(name)]

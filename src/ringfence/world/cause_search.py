@@ -157,7 +157,7 @@ def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explai
     more = [one for one in beside(best.cause, names) if _varies(steps, one)]
     while True:
         tried = [*weighted_of(steps, best, explained), *tilted_of(steps, best, explained, more)]
-        found = [counted(steps, cause, explained) for cause in tried]
+        found = [counted(steps, cause, explained) for cause in tried if cause != best.cause]
         least = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
         better = next((one for one in found if one.gain >= least), best)
         gained, error = gain(steps, explained.beside(best), better.safe)

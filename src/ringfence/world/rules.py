@@ -21,7 +21,7 @@ NEEDLESS = 0.002  # share of the unsafe steps by which a condition has to make f
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which a weight is tried to be more or less, ever finer
 TRIED = (10, 3, 3, 3)  # such factors to either side
 WEIGHTS = (0.5, 0.7, 1.4, 2.0)  # times which an agent's weight in a sum is tried
-MOST_TERMS = 3  # that a threshold depends on
+MOST_TERMS = 3  # that are added to a condition at once, and of which one that has more is left as it is
 AS_LIKELY = 0.02  # of a loss, by which it may be more where what is read is simpler
 LIKELY = 5  # numbers, of which these are
 FEW = 30  # steps of either kind, below which no threshold is a line
@@ -85,10 +85,12 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     some = _read(steps, one, explained, SCREENED)[0]
     best: tuple[int, int, _Near, list[Quantity]] | None = None
     for k, old in enumerate(conditions):
-        near = _Near.of(some, one.cause, conditions, k)
         known = {d for leaf in leaves(old) for d in leaf.at}
         free = [each for each in more if not known >= {d for leaf in leaves(each) for d in leaf.at}]
-        if free and min(near.bad.sum(), near.fine.sum()) >= FEW:
+        if not free or len(old.parts) > MOST_TERMS:
+            continue
+        near = _Near.of(some, one.cause, conditions, k)
+        if min(near.bad.sum(), near.fine.sum()) >= FEW:
             fewer, likely = near.likely(free)
             if best is None or fewer > best[0]:
                 best = fewer, k, near, likely

@@ -67,7 +67,7 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     }
     if reward:  # what a frame's action earned, in the frame in which it arrived
         columns["reward"] = np.zeros(frames)
-        follows = np.diff(single["episode_index"]) == 0
+        follows = single["episode_index"][1:] == single["episode_index"][:-1]
         columns["reward"][1:][follows] = numbers(single, REWARD)[:-1][follows]
     table, names = _by_agent(columns, agents, states, actions)
     missing = frames != info.frames

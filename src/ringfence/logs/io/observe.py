@@ -88,8 +88,12 @@ class _Now:
             first_axis = next((axis for axis in SPACE if axis in self.columns), None)
             # nobody is as far along the first axis as one senses
             return np.where(who >= 0, theirs, self.sensing_radius if column == first_axis else 0.0)
-        made = f" to state: what {what[1:]} changed by since the row before, in m/s" if what[1:] in self.columns else ""
-        raise UserError(f"The logs observe '{name}', which state and goal do not tell; add {what or 'it'}{made}.")
+        made = whose == "own" and what[:1] == "v" and what[1:] in self.columns
+        remedy = (
+            f"add {what} to state: what {what[1:]} changed by since the row before, per second" if made else "add it"
+        )
+        raise UserError(f"The logs observe '{name}', which state and goal do not tell; {remedy}.")
+
 
 def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots: int) -> np.ndarray:
     """(N, slots) whom each agent sees."""

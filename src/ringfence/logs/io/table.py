@@ -313,8 +313,8 @@ def _made_of(schema: TableSchema) -> Iterator[str]:
         )
     made = [axis for axis in schema.axes if f"v{axis}" not in schema.velocity]
     if made:
-        velocities = ", ".join(f"v{axis}" for axis in made)
-        yield f"{velocities}: what {', '.join(made)} changed by since the row before; observe() is to be given these"
+        changes = f"what {', '.join(made)} changed by since the row before, per second"
+        yield f"{', '.join(f'v{axis}' for axis in made)}: {changes}; give these to observe()"
     if not schema.action:
         yield "actions are accelerations, differences of velocities"
 
