@@ -23,6 +23,7 @@ WIDENED = (5, 10, 15)  # rows ahead of which its words say what they ask for
 LITTLE = 0.05  # margins, of which they say nothing
 PUT = ", put into held-out states"  # what names of answers about somebody end with
 UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
+LISTED = 6  # entries of a kind that its words list
 SHOWN = 3  # things that a barrier reads, beside distances, whose prediction its words show
 NO_CLIMB = ": guards that climb them (refine, full) are refused"
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
@@ -283,8 +284,9 @@ def _of_data(card: Card) -> Iterator[str]:
     given = {entry: name for entry, name in inferred.items() if not UNNAMED.match(entry)}
     if read := [f"{name} ({entry})" for entry, name in given.items() if LESS not in entry]:
         yield f"Logs tell what these entries are, which are read by other names than given: {', '.join(read)}."
-    if apart := dict.fromkeys(name.rpartition(".")[2] for entry, name in given.items() if LESS in entry):
-        yield f"What others' entries are is read less what one's own are, too: {', '.join(apart)}."
+    if apart := [f"{name} ({entry})" for entry, name in given.items() if LESS in entry]:
+        more = f" and {len(apart) - LISTED} more" if len(apart) > LISTED else ""
+        yield f"Entries are read less one's own, too: {', '.join(apart[:LISTED])}{more}."
     if card.data.partners:
         yield "Who is in lists of the nearest is found by what two see of each other; predictions read what these do."
     if card.data.impacts:
