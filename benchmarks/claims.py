@@ -304,6 +304,14 @@ def of_systems() -> tuple[bool, str]:
     return holds, f"{most:.3f} at most on {len(fine)}, at nine tenths of the return; naive more on {', '.join(more)}"
 
 
+@on("results/proving/again")
+def of_again() -> tuple[bool, str]:
+    """Systems that were played again by Worlds with rules, of seed 0."""
+    found = [of_json(file) for file in sorted((RESULTS / "proving" / "again").glob("*.json"))]
+    clone, naive = (max(f["rows"][f"{who} shield learned"]["violation_rate"] for f in found) for who in ("bc", "naive"))
+    return (len(found), clone) == (10, 0) and naive < 0.0171, f"{100 * clone:.1f}, {100 * naive:.1f} % at most"
+
+
 @on("results/proving")
 def of_bad_driving() -> tuple[bool, str]:
     """Systems on which the guard leaves the naive driver at most 2 %, as it is and by three rows."""
@@ -950,6 +958,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "keeps 9 of 10 limits on Simple Spread": limits_learned,
     },
     "docs/proving-ground.md": {
+        "guarded clones never violate, naive drivers in at most 1.7 % of 60 episodes": of_again,
         "Fourteen of sixteen guarded clones violate in at most 1 % of their episodes": of_systems,
         "On twelve systems the guard leaves it at most 2 %, at nine tenths of the oracle's return; a guard "
         "that looks three steps ahead on eight": of_bad_driving,
