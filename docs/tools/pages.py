@@ -99,7 +99,7 @@ REFERENCE = {
     "Simulators": ("ringfence.envs", "ringfence.envs.pettingzoo"),
     "Statistics": ("ringfence.evaluation.statistics",),
     "Benchmark": ("ringfence.bench",),
-    "Reports": ("ringfence.report",),
+    "Reports": ("ringfence.report.page", "ringfence.report.board_page", "ringfence.report.export"),
     "Errors and files": ("ringfence.errors", "ringfence.utils.files"),
 }
 # Of an algorithm's module its settings and its values: losses and updates are read in the source.
