@@ -82,6 +82,8 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     """The cause with a line of one or a few numbers more in the place of one of its thresholds: of that by which most
     steps are told rightly."""
     conditions = _conditions(one)
+    if not conditions or not more:
+        return
     some = _read(steps, one, explained, SCREENED)[0]
     best: tuple[int, int, _Near, list[Quantity]] | None = None
     for k, old in enumerate(conditions):
@@ -101,12 +103,12 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     whole = _Near.of(read, one.cause, conditions, k)
     terms: list[Quantity] = []
     while likely and len(terms) < MOST_TERMS:
-        losses = [few.likeliest([*terms, one])[0] for one in likely]
-        alike = (one for one, loss in zip(likely, losses) if loss <= (1 + AS_LIKELY) * min(losses))
-        terms = [*terms, min(alike, key=lambda one: not isinstance(one, Entry))]
+        losses = [few.likeliest(few.of_quantities([*terms, each]))[0] for each in likely]
+        alike = (each for each, loss in zip(likely, losses) if loss <= (1 + AS_LIKELY) * min(losses))
+        terms = [*terms, min(alike, key=lambda each: not isinstance(each, Entry))]
         likely.remove(terms[-1])
         numbers = whole.of_quantities(terms)
-        found, at = whole.refined(numbers, few.likeliest(terms, raw=True)[1])
+        found, at = whole.refined(numbers, few.likeliest(few.of_quantities(terms), raw=True)[1])
         old, weights = conditions[k], tuple(float(w) for w in found)
         new = Sum((*old.parts, *terms), (*old.weights, *weights), float((old.more or 0.0) - at))
         alone = replace(whole, values=np.zeros_like(whole.values)).best(numbers, found)
@@ -186,12 +188,11 @@ class _Near:
         x, agents = self.read.steps.x, self.read.agents
         return np.stack([_of_picked(one, x, agents, self.things)[self.at] for one in quantities], -1)
 
-    def likeliest(self, quantities: Sequence[Quantity], raw: bool = False) -> tuple[float, np.ndarray]:
-        """(loss, weights (K,) of quantities, in deviations of each or as they are) by which the condition makes steps
-        likeliest: a noisy-or over all that is near, whose log-odds are linear."""
+    def likeliest(self, numbers: np.ndarray, raw: bool = False) -> tuple[float, np.ndarray]:
+        """(loss, weights (K,) of numbers (M, K), in deviations of each or as they are) by which the condition makes
+        steps likeliest: a noisy-or over all that is near, whose log-odds are linear."""
         from scipy.optimize import minimize  # slow to import, and read by fits alone
 
-        numbers = self.of_quantities(quantities)
         spread = numbers.std(0)
         usable = spread > 0
         unit = float(self.values.std()) or 1.0
@@ -221,7 +222,7 @@ class _Near:
     def likely(self, quantities: Sequence[Quantity]) -> tuple[int, list[Quantity]]:
         """(by how many steps fewer are told wrongly where the condition reads all of these, too, the likeliest)."""
         numbers = self.of_quantities(quantities)
-        weights = self.likeliest(quantities, raw=True)[1]
+        weights = self.likeliest(numbers, raw=True)[1]
         fewer = self.best(numbers[:, :0], weights[:0])[0] - self.best(numbers, weights)[0]
         order = np.argsort(-np.abs(weights * numbers.std(0)))[:LIKELY]
         return fewer, [quantities[j] for j in order if weights[j]]

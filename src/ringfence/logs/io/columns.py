@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, reading, reason, unknown
+from ringfence.errors import StoreError, UserError, needs, reading, reason, unknown
 from ringfence.logs.io.formats import as_numpy, names_in, read_fcd, read_json_lines, read_obsmat, read_parquet
 
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
@@ -237,7 +237,7 @@ def is_missing(entry: Any) -> bool:
 
 def _frame(table: Any) -> Any:
     """A data frame of any library as narwhals' own."""
-    narwhals = needs("narwhals")
+    narwhals = reader("narwhals")
     try:
         return narwhals.from_native(table, eager_only=True)
     except Exception as error:  # names of columns that are no words, or there twice: each library has its own refusal
@@ -251,13 +251,10 @@ def _frame(table: Any) -> Any:
         ) from None
 
 
-def needs(module: str) -> ModuleType:
-    try:
+def reader(module: str) -> ModuleType:
+    """A package that reads tables."""
+    with needs("tables", "Tables"):
         return importlib.import_module(module)
-    except ImportError:
-        raise UserError(
-            f"Tables are read by {module.partition('.')[0]}; install it with pip install 'ringfence[tables]'."
-        ) from None
 
 
 def _read_file(path: Path, wanted: list[str] | None, form: Form) -> Columns:
@@ -282,7 +279,7 @@ def rows_of(path: Path) -> int:
         return 0
     if path.suffix.lower() not in PARQUET:
         return path.stat().st_size // LINE
-    needs("pyarrow")
+    reader("pyarrow")
     from pyarrow import parquet
 
     with reading(path, "Parquet file"), parquet.ParquetFile(path) as file:
@@ -298,7 +295,7 @@ def batches(
     if kind not in (*PARQUET, ".csv") or not path.is_file() or (form.header and kind == ".csv"):
         yield read_columns(path, names_of(path, form) if wanted is None else wanted, form)
         return
-    pyarrow = needs("pyarrow")
+    pyarrow = reader("pyarrow")
     from pyarrow import csv, parquet
 
     with reading(path, "table that can be read", "write it again"):
@@ -344,7 +341,7 @@ def _or(kinds: Iterable[str]) -> str:
 def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
     """Columns of a Parquet file, or of text, separated by what separates the first line; by spaces only where the form
     names the columns."""
-    needs("pyarrow")
+    reader("pyarrow")
     from pyarrow import csv
 
     table = None

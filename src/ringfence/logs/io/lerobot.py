@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, one_of, reading
-from ringfence.logs.io.columns import Columns, Table, by_entry, known, needs, numbers, stacked
+from ringfence.logs.io.columns import Columns, Table, by_entry, known, numbers, reader, stacked
 from ringfence.logs.io.formats import names_in, read_parquet
 from ringfence.utils import schemas
 from ringfence.utils.text import natural
@@ -136,7 +136,7 @@ def _read_files(folder: Path, wanted: list[str]) -> Columns:
     files = sorted(folder.glob("data/*/*.parquet"), key=lambda file: natural(str(file)))
     if not files:
         raise StoreError(f"'{folder}' holds no data/*/*.parquet; download the data set with its data, films aside.")
-    needs("pyarrow")
+    reader("pyarrow")
     for file in files:
         known(wanted, names_in(file))
     return read_parquet(files, wanted)
