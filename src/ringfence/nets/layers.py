@@ -4,6 +4,7 @@ conditions, windows as vectors, and what the small networks mean, on features in
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 
 import equinox as eqx
@@ -64,12 +65,17 @@ class MLP(eqx.Module):
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))  # operation by operation takes a program each
 def _initial(key: Key, sizes: tuple[int, ...], groups: int, final_scale: float) -> tuple[list[Array], list[Array]]:
     """Weights (G, F_in, F_out) and biases (G, F_out) of each layer."""
+    shapes = [(groups, *of_layer) for of_layer in itertools.pairwise(sizes)]
+    counts = [math.prod(shape) for shape in shapes]
+    # All layers' normal numbers at once, as `jax.random.normal` draws each layer's: a draw takes long to compile.
+    above = np.nextafter(np.float32(-1), np.float32(0))
+    drawn = jax.vmap(lambda k: jax.random.uniform(k, (max(counts),), minval=above))(jax.random.split(key, len(shapes)))
+    drawn = jax.lax.erf_inv(drawn)
     weights = []
-    keys = jax.random.split(key, len(sizes) - 1)
-    for layer, (k, fan_in, fan_out) in enumerate(zip(keys, sizes[:-1], sizes[1:])):
-        last = layer == len(sizes) - 2
-        gain = (1.0 / fan_in) ** 0.5 * final_scale if last else (2.0 / fan_in) ** 0.5
-        weights.append(jax.random.normal(k, (groups, fan_in, fan_out)) * gain)
+    for layer, (shape, count) in enumerate(zip(shapes, counts)):
+        last = layer == len(shapes) - 1
+        gain = (1.0 / shape[1]) ** 0.5 * final_scale if last else (2.0 / shape[1]) ** 0.5
+        weights.append(drawn[layer, :count].reshape(shape) * np.float32(2**0.5) * gain)
     return weights, [jnp.zeros((groups, fan_out)) for fan_out in sizes[1:]]
 
 

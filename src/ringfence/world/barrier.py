@@ -41,7 +41,7 @@ from ringfence.world.settings import Settings
 Widening = tuple[float, ...]  # by row ahead, in margins
 DANGEROUS = ("other", "obstacle", "wall")  # kinds of things that names may tell of, each with a pair network of its own
 FARTHEST = 15.0  # scores end softly there: log-odds that no data can tell apart
-BATCH = 512  # steps
+BATCH = 128  # steps
 RATE = 0.02  # at which the slow copy of V follows
 UNSURE = 5.0  # score that g_0 begins with, so that pairs explain danger first
 

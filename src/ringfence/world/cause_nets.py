@@ -26,7 +26,7 @@ from ringfence.utils.precision import on_device
 from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found
 from ringfence.world.settings import Settings
 
-BATCH = 512  # steps
+BATCH = 128  # steps
 HOT = 10.0  # temperature that learning begins with: many causes share a cost
 COOLED = 0.6  # share of the updates after which it is 1: odds add up
 MARGINAL = 0.05  # weight of the term by which each score explains the cost alone

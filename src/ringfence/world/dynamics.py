@@ -34,7 +34,7 @@ from ringfence.world.settings import Settings
 AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
 Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
 STATES = 20_000  # steps that features and their changes are standardised by
-BATCH = 128  # small and often: at equal time it learns contacts that 512 at half the rate does not
+BATCH = 64  # small and often: it learns contacts that larger ones, of fewer updates, do not
 
 
 class Heading(msgspec.Struct, frozen=True):

@@ -39,7 +39,7 @@ from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World, blank_world
 
-FORMAT = 16  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
+FORMAT = 17  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.9  # recall of causes, below which networks on all entries are tried, too
 STATES = 20_000  # steps that a barrier's features are standardised by
@@ -238,11 +238,11 @@ def _unsafe_cost(store: EpisodeStore, name: str) -> float:
 
 def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
     """The parts of a World, and about how many seconds each takes on two cores: a bar is to say what is left."""
-    found = [("reading", 1.0), ("values", settings.value_updates * 3e-3)]
-    found += [("dynamics", settings.dynamics_updates * settings.num_ensemble * 4e-4)]
+    found = [("reading", 1.0), ("values", settings.value_updates * 1e-3)]
+    found += [("dynamics", settings.dynamics_updates * settings.num_ensemble * 3e-4)]
     for _ in range(max(1, constraints) * settings.barrier):
         found += [("causes", 5.0)] * settings.causes
-        found += [("label", settings.barrier_updates * 1.5e-3), ("future", settings.future_updates * 3e-3)]
+        found += [("label", settings.barrier_updates * 1e-3), ("future", settings.future_updates * 2e-3)]
     return [*found, ("card", 8.0), ("search", 4.0)]
 
 
