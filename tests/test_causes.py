@@ -290,6 +290,24 @@ def test_thresholds_may_depend_on_other_numbers():
     np.testing.assert_allclose(cause.reads[0].weights[1] / cause.reads[0].weights[0], 50.0, rtol=0.02)
 
 
+def test_danger_may_grow_with_a_square_or_a_product():
+    """Too fast to stop before a wall, too near to stop, thrown aside in a bend, and too much power."""
+    rng = np.random.default_rng(0)
+    place, speed, turn = (rng.normal(0, size, (20_000, 2)) for size in (3.0, 1.5, 0.7))
+    ahead = rng.uniform(0, 12, (20_000, 2))
+    cases = {
+        "the square of own.vx": (["own.x", "own.vx"], (place, speed), place + 0.5 * speed * np.abs(speed) > 6),
+        "the square of own.v": (["own.gap", "own.v"], (ahead, np.abs(speed)), ahead < speed**2 / 3),
+        "|own.v times own.yaw_rate|": (["own.v", "own.yaw_rate"], (speed, turn), np.abs(speed * turn) > 2),
+        "own.v times own.force": (["own.v", "own.force"], (speed, place), speed * place > 8),
+    }
+    for name, (names, numbers, unsafe) in cases.items():
+        x = np.stack(numbers, -1).astype(np.float32)
+        found, _ = cause_search.find(x, unsafe.any(1), np.arange(20_000) // 40, names)
+        assert found.explained > 0.98 and found.false_alarms < 0.004, (name, found)
+        assert name in found.causes[0].name
+
+
 def test_any_of_several_thresholds_may_depend_on_a_number():
     """Who crosses while somebody comes from the right within 2 s, and who is in sight to either side of a heading."""
     rng = np.random.default_rng(0)

@@ -8,7 +8,19 @@ from collections.abc import Iterator, Sequence
 
 from ringfence.problem.entries import LANE, SPACE, Entries, axes_of
 from ringfence.world.causes import Cause
-from ringfence.world.quantities import All, Closing, Entry, Length, Over, Product, Quantity, Sum, Turned, leaves
+from ringfence.world.quantities import (
+    All,
+    Closing,
+    Entry,
+    Length,
+    Over,
+    Product,
+    Quantity,
+    Sum,
+    Turned,
+    leaves,
+    squared,
+)
 
 WIDEST = 4  # numbers of one cause
 ROW = 3  # entries at least that names number
@@ -64,6 +76,9 @@ def pairs(names: Sequence[str]) -> Iterator[Cause]:
         if len(vector) > 1 and len(one) < 3 and not set(one) & set(vector):
             entries = tuple(Entry((own[name],), name) for name in one)
             yield Cause((*entries, Length(tuple(Entry((own[name],), name) for name in vector))))
+    for product in _products(own):
+        yield Cause((product,))
+        yield Cause((Length((product,)),))
 
 
 def of_several(names: Sequence[str]) -> Iterator[Cause]:
@@ -93,8 +108,15 @@ def _of_three(offset: tuple[Entry, ...]) -> Iterator[Cause]:
         yield Cause((Turned((one[0], one[1]), tuple(two), "angle"),))
 
 
+def _products(own: dict[str, int]) -> list[Quantity]:
+    entries = [Entry((d,), name) for name, d in own.items()]
+    both = list(itertools.combinations(entries, 2))
+    return [Product(each) for each in both] if len(both) <= MOST_PAIRS else []
+
+
 def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:
-    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are."""
+    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are;
+    their squares, as of a way to stop, and products."""
     own, several = _own(names), things_of(names)
     found = _numbers("", [own])
     for kind, each in several.items():
@@ -103,6 +125,8 @@ def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:
             found += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
             found += _closing(kind, each, axes, own) if axes else ()
     yield from found
+    yield from map(squared, found)
+    yield from _products(own)
 
 
 def of_team(names: Sequence[str]) -> Iterator[Cause]:

@@ -147,7 +147,10 @@ class Product(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def words(self) -> str:
-        return " times ".join(part.words for part in self.parts)
+        one, other = self.parts
+        if other in (one, Length((one,))):
+            return f"the square of {one.words}"
+        return f"{one.words} times {other.words}"
 
 
 class All(msgspec.Struct, frozen=True, tag=True):
@@ -199,6 +202,11 @@ class Over(msgspec.Struct, frozen=True, tag=True):
 
 
 Quantity: TypeAlias = Entry | Length | Closing | Turned | Sum | Product | All | Over
+
+
+def squared(quantity: Quantity) -> Product:
+    """Its square, negative where it is."""
+    return Product((quantity, quantity if isinstance(quantity, Length) else Length((quantity,))))
 
 
 def leaves(quantity: Quantity) -> Iterator[Entry]:

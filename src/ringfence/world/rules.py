@@ -11,7 +11,7 @@ import numpy as np
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
 from ringfence.world.causes import VISITED, Cause, Cells
-from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many, leaves
+from ringfence.world.quantities import All, Over, Product, Quantity, Sum, how_many, leaves, squared
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
@@ -57,7 +57,7 @@ class _Side:
 
 def rules_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause]:
     """The cause as rules, by the steps that others leave unexplained: a box around its danger, and of two numbers a
-    line."""
+    line, also one of a number and of the other's square: what it takes to stop grows so."""
     cause = one.cause
     read, scale = _read(steps, one, explained)
     if not read.bad.any():
@@ -67,11 +67,16 @@ def rules_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause
     if len(sides) > 1:
         yield _reading(cause, All(tuple(_condition(cause.reads, side, scale, units) for side in sides)))
     if cause.width == 2:
-        line = _line(read, one.cells)
-        if line is not None:
-            sign, weight, at = line
-            weights = sign[0], float(sign[1] * weight * scale[0] / scale[1])
-            yield _reading(cause, Sum(cause.reads, weights, -float(at * scale[0])))
+        for squares in ((), (1,), (0,)):
+            values, reads, units = read.values.copy(), list(cause.reads), scale.copy()
+            for k in squares:
+                values[..., k] *= abs(values[..., k])
+                reads[k], units[k] = squared(reads[k]), units[k] ** 2
+            line = _line(replace(read, values=values), one.cells)
+            if line is not None:
+                sign, weight, at = line
+                weights = sign[0], float(sign[1] * weight * units[0] / units[1])
+                yield _reading(cause, Sum(tuple(reads), weights, -float(at * units[0])))
 
 
 def _reading(cause: Cause, read: Quantity) -> Cause:
@@ -87,8 +92,7 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     some = _read(steps, one, explained, SCREENED)[0]
     best: tuple[int, int, _Near, list[Quantity]] | None = None
     for k, old in enumerate(conditions):
-        known = {d for leaf in leaves(old) for d in leaf.at}
-        free = [each for each in more if not known >= {d for leaf in leaves(each) for d in leaf.at}]
+        free = [each for each in more if _is_new(each, old)]
         if not free or len(old.parts) > MOST_TERMS:
             continue
         near = _Near.of(some, one.cause, conditions, k)
@@ -105,7 +109,7 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     while likely and len(terms) < MOST_TERMS:
         losses = [few.likeliest(few.of_quantities([*terms, each]))[0] for each in likely]
         alike = (each for each, loss in zip(likely, losses) if loss <= (1 + AS_LIKELY) * min(losses))
-        terms = [*terms, min(alike, key=lambda each: not isinstance(each, Entry))]
+        terms = [*terms, min(alike, key=lambda each: len(list(leaves(each))))]
         likely.remove(terms[-1])
         numbers = whole.of_quantities(terms)
         found, at = whole.refined(numbers, few.likeliest(few.of_quantities(terms), raw=True)[1])
@@ -118,6 +122,13 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
             new = Sum(tuple(terms), tuple(unit * w for w in weights), -unit * alone[1])
         parts = _settled(read, one.cause, (*conditions[:k], new, *conditions[k + 1 :]))
         yield _reading(one.cause, parts[0] if len(parts) == 1 else All(parts))
+
+
+def _is_new(each: Quantity, old: Sum) -> bool:
+    """Whether a number may shift a condition: it reads something else, or is the square of what is read."""
+    known = {d for leaf in leaves(old) for d in leaf.at}
+    squares = [squared(part) for part in old.parts]
+    return each not in old.parts and (each in squares or not known >= {d for leaf in leaves(each) for d in leaf.at})
 
 
 def _settled(read: _Read, cause: Cause, conditions: tuple[Sum, ...]) -> tuple[Sum, ...]:
@@ -220,12 +231,15 @@ class _Near:
         return float(found.fun), weights
 
     def likely(self, quantities: Sequence[Quantity]) -> tuple[int, list[Quantity]]:
-        """(by how many steps fewer are told wrongly where the condition reads all of these, too, the likeliest)."""
+        """(by how many steps fewer are told wrongly where the condition reads all of these, too, the likeliest, and
+        what is multiplied in them)."""
         numbers = self.of_quantities(quantities)
         weights = self.likeliest(numbers, raw=True)[1]
         fewer = self.best(numbers[:, :0], weights[:0])[0] - self.best(numbers, weights)[0]
         order = np.argsort(-np.abs(weights * numbers.std(0)))[:LIKELY]
-        return fewer, [quantities[j] for j in order if weights[j]]
+        found = [quantities[j] for j in order if weights[j]]
+        roots = [part for one in found if isinstance(one, Product) for part in one.parts if part in quantities]
+        return fewer, list(dict.fromkeys([*found, *roots]))
 
     def refined(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """Weights of numbers (M, K) by which fewest steps are told wrongly, each in turn, and where danger begins."""
