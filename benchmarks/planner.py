@@ -111,7 +111,7 @@ GROUPS: dict[str, dict[str, Any]] = {
         "plays": ("1 steps", "2 steps", "3 steps", "10 steps", "20 steps", "temperature 0", "temperature 0.3"),
     },
     "algorithm1": {
-        "tasks": LEARNED,
+        "tasks": SPREAD + POOLED + ROBOTS,
         "rows": {f"λ = {w:g}": ("icbf", "algorithm1", {"barrier_weight": w}) for w in (0.0, 0.1, 1.0, 10.0)},
         "plays": ("as it is",),
     },

@@ -161,8 +161,8 @@ def glance() -> str:
             cells.append(logs if logs != "–" else pooled_logs(task))
         else:
             rows = rows_of("robots", task)
-            cells += ["–", robot(played(rows, "icbf", "cool"), task)]
-            cells += [robot(played(rows, "icbf", "cool, under adapt"), task), "–"]
+            cells.append(robot(played(rows_of("algorithm1", task), "λ = 1", "cool"), task))
+            cells += [robot(played(rows, "icbf", way), task) for way in ("cool", "cool, under adapt")] + ["–"]
             cells.append(sums_of("guards-mujoco", task, ("bc", "default+adapt-learned")))
             cells.append(sums_of("mujoco", task, ("behaviour data", "reference")))
         lines.append(cells)

@@ -393,6 +393,19 @@ def test_scarce_danger_has_a_cause_that_tells_all_of_it(logged, monkeypatch):
     assert not cause_search.find(x, unsafe, episode, NAMES)[0].causes
 
 
+def test_who_must_be_near_some_is_lost_near_others():
+    """Within 4 m of either base, and away from who is no base, which is known once the first is."""
+    rng = np.random.default_rng(0)
+    offset = rng.normal(0, 3.5, (20_000, 1, 3, 2))
+    far = np.linalg.norm(offset, axis=-1)
+    lost, met = far[..., :2].min(-1) > 4, far[..., 2] < 1.5
+    x = offset.reshape(20_000, 1, 6).astype(np.float32)
+    names = [f"other{j}.{d}" for j in range(3) for d in ("dx", "dy")]
+    found, _ = cause_search.find(x, (lost | met)[:, 0], np.arange(20_000) // 40, names)
+    assert found.explained > 0.98 and found.false_alarms < 0.005
+    assert any("the nearest among other0, other1" in cause.name for cause in found.causes)
+
+
 def test_what_holds_for_some_agents_alone_is_found(logged):
     """The first two must not drift apart; the third may go where it likes."""
     x, _, episode = logged

@@ -130,6 +130,8 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str],
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
     chosen = _as_rules(steps, chosen, shapes, names)
     found = _as_rules(steps, found, shapes, names)
+    if not _tell_enough(steps, found):  # exact ones leave more to tell than those that they were made of
+        found = _pruned(steps, _added(steps, found, [one.cause for one in chosen]))
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
     worse = _wrong_together(steps, found) - _wrong_together(steps, chosen) > NEEDLESS * steps.unsafe.sum()
@@ -146,9 +148,25 @@ def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names:
     """The causes, those of several numbers as rules where these tell as much."""
     for k, one in enumerate(chosen):
         explained = _without(steps, chosen, one)
-        best = _as_rule(steps, one, pool, explained) if one.cause.width > 1 else counted(steps, one.cause, explained)
+        best = _as_rule(steps, one, pool, explained) if one.cause.width > 1 else _among(steps, one, explained)
         chosen = [*chosen[:k], _tilted(steps, best, names, explained), *chosen[k + 1 :]]
     return _pruned(steps, chosen)
+
+
+def _among(steps: Steps, one: Counted, explained: Explained) -> Counted:
+    """The cause of the nearest of several things without those that tell nothing: who must be near some is lost when
+    near others, too."""
+    best = counted(steps, one.cause, explained)
+    while isinstance(read := best.cause.reads[0], Over) and read.rank and read.count > 1:
+        among = read.among or tuple(range(read.count))
+        rest = [tuple(j for j in among if j != left) for left in among]
+        fewer = [replace(read, rank=min(read.rank, len(some)), count=len(some), among=some) for some in rest]
+        tried = [counted(steps, replace(best.cause, reads=(each,)), explained) for each in fewer]
+        more = max(tried, key=lambda each: each.gain)
+        if more.gain <= (1 + SIMPLER) * best.gain:
+            break
+        best = more
+    return best
 
 
 def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained) -> Counted:

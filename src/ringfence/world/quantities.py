@@ -175,10 +175,13 @@ class Over(msgspec.Struct, frozen=True, tag=True):
     rank: int = 0  # from 1 on; 0: the sum
     count: int = 0  # of the things; of a team it is as large as it is
     weights: tuple[float, ...] = ()  # of agents in a sum over the team; none: alike
+    among: tuple[int, ...] = ()  # which of the things; none: all
 
     def of(self, x: Any) -> Any:
         """(..., N, 1) of features (..., N, D)."""
         each = self.part.of(x)
+        if self.among:
+            each = _picked(each, self.among)
         if self.weights:
             each = _times(each, _constant(each, np.array(self.weights, np.float32)[:, None]))
         if self.axis == "things":
@@ -197,7 +200,9 @@ class Over(msgspec.Struct, frozen=True, tag=True):
         if not self.rank:
             return f"sum of {self.part.words} {whose}"
         if self.axis == "things" and self.part.words.endswith(".distance"):
-            return f"{self.part.words} of the {ORDINALS[self.rank - 1]}nearest"
+            kind = self.part.words.removesuffix(".distance")
+            among = f" among {', '.join(f'{kind}{j}' for j in self.among)}" if self.among else ""
+            return f"{self.part.words} of the {ORDINALS[self.rank - 1]}nearest{among}"
         return f"{ORDINALS[self.rank - 1]}lowest {self.part.words} {whose}"
 
 
