@@ -618,7 +618,8 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
     for name, how in {"usual": {}, "no margin": {"margin": 0.0}, "beyond": {"within_logs": False}}.items():
         pilot = guard(lambda seen, state: out, world, guard="shield", **how)
         ends[name] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
-    assert max(ends["usual"], ends["no margin"]) < 1.23 < 1.25 < ends["beyond"], "whatever margin is kept"
+    kept = max(ends["usual"], ends["no margin"])
+    assert kept < 1.23 and kept + 0.1 < ends["beyond"], "whatever margin is kept"
     rows = np.stack([row] * 11)[None, None]
     slowest, fastest = ranges["own.v"]
     rows[0, 0, [1, -2], 0, 2] = fastest + 0.02 * (fastest - slowest)

@@ -32,7 +32,7 @@ from ringfence.world.cause_counts import (
     within,
 )
 from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found, narrowed, only_of, only_where
-from ringfence.world.quantities import Entry, Length, Over, Quantity, leaves
+from ringfence.world.quantities import Entry, Length, Over, Product, Quantity, leaves
 from ringfence.world.rules import rules_of, tilted_of, weighted_of
 
 MOST = 8  # causes
@@ -173,17 +173,25 @@ def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explai
     """The cause with thresholds that depend on other numbers, or a sum over the team with weights, while these tell
     clearly more: boxes as long as both are, limits that fall along a way."""
     more = [one for one in beside(best.cause, names) if _varies(steps, one)]
-    while True:
+    plain = [one for one in more if not isinstance(one, Product)]
+    return _shifted(steps, _shifted(steps, best, plain, explained), more, explained)
+
+
+def _shifted(steps: Steps, best: Counted, more: Sequence[Quantity], explained: Explained) -> Counted:
+    """The cause with thresholds that depend on some of these numbers, while it tells clearly more so."""
+    least = NEEDLESS * steps.unsafe.sum()
+    while (before := _told_wrong(steps, best, explained)) > least:
         tried = [*weighted_of(steps, best, explained), *tilted_of(steps, best, explained, more)]
         found = [counted(steps, cause, explained) for cause in tried if cause != best.cause]
-        least = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
-        better = next((one for one in found if one.gain >= least), best)
+        enough = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
+        better = next((one for one in found if one.gain >= enough), best)
         gained, error = gain(steps, explained.beside(best), better.safe)
         lost = gain(steps, explained.beside(better), best.safe)[0]
-        before, after = (_told_wrong(steps, one, explained) for one in (best, better))
-        if before - after <= max(SLANTED * before, NEEDLESS * steps.unsafe.sum()) or gained - lost <= SURE * error:
-            return best
+        less = before - _told_wrong(steps, better, explained)
+        if less <= max(SLANTED * before, least) or gained - lost <= SURE * error:
+            break
         best = better
+    return best
 
 
 def _told_wrong(steps: Steps, one: Counted, explained: Explained) -> int:

@@ -238,7 +238,7 @@ def _unsafe_cost(store: EpisodeStore, name: str) -> float:
 
 def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
     """The parts of a World, and about how many seconds each takes on two cores: a bar is to say what is left."""
-    found = [("reading", 1.0), ("values", settings.value_updates * 1e-3)]
+    found = [("reading", 1.0), ("values", settings.value_updates * 2e-3)]
     found += [("dynamics", settings.dynamics_updates * settings.num_ensemble * 3e-4)]
     for _ in range(max(1, constraints) * settings.barrier):
         found += [("causes", 5.0)] * settings.causes

@@ -11,7 +11,7 @@ import numpy as np
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
 from ringfence.world.causes import VISITED, Cause, Cells
-from ringfence.world.quantities import All, Over, Product, Quantity, Sum, how_many, leaves, squared
+from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many, leaves, squared
 
 SWEEPS = 4  # in which every threshold is looked for in turn
 MOST_READ = 20_000_000  # numbers that a rule is looked for in
@@ -109,7 +109,7 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
     while likely and len(terms) < MOST_TERMS:
         losses = [few.likeliest(few.of_quantities([*terms, each]))[0] for each in likely]
         alike = (each for each, loss in zip(likely, losses) if loss <= (1 + AS_LIKELY) * min(losses))
-        terms = [*terms, min(alike, key=lambda each: len(list(leaves(each))))]
+        terms = [*terms, min(alike, key=lambda each: not isinstance(each, Entry))]
         likely.remove(terms[-1])
         numbers = whole.of_quantities(terms)
         found, at = whole.refined(numbers, few.likeliest(few.of_quantities(terms), raw=True)[1])
@@ -231,15 +231,12 @@ class _Near:
         return float(found.fun), weights
 
     def likely(self, quantities: Sequence[Quantity]) -> tuple[int, list[Quantity]]:
-        """(by how many steps fewer are told wrongly where the condition reads all of these, too, the likeliest, and
-        what is multiplied in them)."""
+        """(by how many steps fewer are told wrongly where the condition reads all of these, too, the likeliest)."""
         numbers = self.of_quantities(quantities)
         weights = self.likeliest(numbers, raw=True)[1]
         fewer = self.best(numbers[:, :0], weights[:0])[0] - self.best(numbers, weights)[0]
         order = np.argsort(-np.abs(weights * numbers.std(0)))[:LIKELY]
-        found = [quantities[j] for j in order if weights[j]]
-        roots = [part for one in found if isinstance(one, Product) for part in one.parts if part in quantities]
-        return fewer, list(dict.fromkeys([*found, *roots]))
+        return fewer, [quantities[j] for j in order if weights[j]]
 
     def refined(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """Weights of numbers (M, K) by which fewest steps are told wrongly, each in turn, and where danger begins."""

@@ -24,7 +24,7 @@ class Settings:
     num_ensemble: Annotated[int, Meta(ge=1, le=20)] = 3  # of the ensemble of forward models
     dynamics_updates: Count = 20_000
     dynamics_width: Width = 128  # units of each of 2 hidden layers
-    value_updates: Count = 16_000  # of the critic, and again of rewards
+    value_updates: Count = 8000  # of the critic, and again of rewards
     barrier: bool = True
     causes: bool = True  # find few entries that tell danger; where there are none, networks on all of them
     loss: Loss = "cross-entropy"  # of labels

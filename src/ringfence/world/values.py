@@ -27,7 +27,8 @@ from ringfence.world.settings import Settings
 
 ROWS = 100_000  # states evaluated at once
 STATES = 20_000  # that features are standardised by, or up to twice as many
-BATCH = 64  # states or steps of an update: what can be climbed is a matter of how many updates, not of what each reads
+BATCH = 64  # states or steps that a step of the optimiser reads
+STEPS = 2  # such steps in an update: what can be climbed is a matter of how many there are, not of what each reads
 WIDTH = 128  # units of each of the critic's 2 hidden layers
 
 
@@ -83,7 +84,7 @@ def fit_values(
     (T,)."""
     key_critic, key_reward, key_net = jax.random.split(key, 3)
     alone = settings.alone
-    updates = settings.value_updates
+    updates = STEPS * settings.value_updates
     rewards = team_mean(arrays["rewards"], alone)
     seen, arrived, returns = _targets(arrays, rewards, picked)
     critic = fit_critic(seen, arrived, returns, key_critic, updates, period=period, weight=map.critic_weight)
