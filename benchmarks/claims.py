@@ -370,7 +370,7 @@ def of_rebounds() -> tuple[bool, str]:
 
 
 MORE, LESS = "more shapes", "no more shapes"
-FAMILIES = "20 of 27 fit; {'clone': 17, 'naive': 16}, at most 7 and 6 of 60"
+FAMILIES = "21 of 27 fit; {'clone': 18, 'naive': 17}, at most 7 and 6 of 60"
 
 
 @on("shapes.csv")
@@ -975,7 +975,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "With more shapes no World is *unfit*, and guarded clones violate in at most 6 %, without in up to "
         "99 %": of_shapes,
         "Only `rays` stays bad": of_rays,
-        "Of 27 Worlds twenty are *fit*": of_families,
+        "Of 27 Worlds twenty-one are *fit*": of_families,
         "Read as they are, such logs make every World *unfit*": of_maps,
         "Who is seen matters to bold drivers": of_trackers,
     },

@@ -855,6 +855,9 @@ def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
     assert verdict.judge(told).reasons == (
         "length of other.dx, other.dy, of the nearest is predicted to 0.7 at 0.96 s, 35% of its deviation",
     )
+    assert verdict.judge(told).word == "weak"
+    worse = msgspec.structs.replace(card((2.2, 2.4), (2.3, 2.5)), causes=told.causes)
+    assert verdict.judge(worse).word == "unfit", "worse than by its mean"
 
 
 @pytest.mark.judged

@@ -162,7 +162,7 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
         if told and share > BEARABLE:
             when = f"{one.seconds[0]:g} s" if one.seconds else f"{one.steps_ahead[0]} steps"
             found = f"{one.name} is predicted to {one.error[0]:.3g} at {when}, {share:.0%} of its deviation"
-            yield "weak", found, remedy
+            yield "unfit" if share > NOTHING else "weak", found, remedy
         if not one.beats_coasting:
             when = f"{one.seconds[-1]:g} s" if one.seconds else f"{one.steps_ahead[-1]} steps"
             ours, theirs = f"{one.error[-1]:.3g}", f"{one.coasting[-1]:.3g}"
