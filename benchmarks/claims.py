@@ -306,10 +306,20 @@ def of_systems() -> tuple[bool, str]:
 
 @on("results/proving/again")
 def of_again() -> tuple[bool, str]:
-    """Systems that were played again by Worlds with rules, of seed 0."""
-    found = [of_json(file) for file in sorted((RESULTS / "proving" / "again").glob("*.json"))]
-    clone, naive = (max(f["rows"][f"{who} shield learned"]["violation_rate"] for f in found) for who in ("bc", "naive"))
-    return (len(found), clone) == (10, 0) and naive < 0.0171, f"{100 * clone:.1f}, {100 * naive:.1f} % at most"
+    """Systems that were played again by Worlds of today, of seed 0: who is left in more than one episode of 60."""
+    found = {
+        file.stem.removeprefix("proving-"): of_json(file) for file in (RESULTS / "proving" / "again").glob("*.json")
+    }
+    rates = {
+        who: {name: one["rows"][f"{who} shield learned"]["violation_rate"] for name, one in found.items()}
+        for who in ("bc", "naive")
+    }
+    fit = [name for name, one in found.items() if one["verdict"] == "fit"]
+    left = {name: rates["naive"][name] for name in fit if rates["naive"][name] > 1.5 / 60}
+    text = f"{len(fit)} of {len(found)} fit; clones {max(rates['bc'][n] for n in fit):.3f} at most; naive {left}"
+    return (len(found), len(fit)) == (16, 14) and sorted(left) == ["bench", "gears"] and not any(
+        rates["bc"][name] for name in fit
+    ), text
 
 
 @on("results/proving")
@@ -961,7 +971,8 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "keeps 9 of 10 limits on Simple Spread": limits_learned,
     },
     "docs/proving-ground.md": {
-        "guarded clones never violate, naive drivers in at most 1.7 % of 60 episodes": of_again,
+        "clones guarded by *fit* Worlds never violate, naive drivers in at most one episode of 60, but on `bench` two "
+        "and on `gears` fifteen": of_again,
         "Fourteen of sixteen guarded clones violate in at most 1 % of their episodes": of_systems,
         "On twelve systems the guard leaves it at most 2 %, at nine tenths of the oracle's return; a guard "
         "that looks three steps ahead on eight": of_bad_driving,
