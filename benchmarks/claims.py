@@ -589,6 +589,17 @@ def of_selection() -> tuple[bool, str]:
     return all(one + 0.1 < eight < many for one, eight, many in earned), f"1 / 8 / 64: {text}"
 
 
+@on("results/pooled")
+def of_robot_pools() -> tuple[bool, str]:
+    """What `flow` earns more than a clone on HalfCheetah's tiers, on the same resets."""
+    more = {}
+    for tier in ("good", "medium", "poor"):
+        rows = of_json(f"pooled/halfcheetah_2x3-{tier}.json")["rows"]
+        more[tier] = pooled.more(rows["flow"], rows["bc, 20,000 updates"])[1]
+    text = ", ".join(f"{tier} [{low:.0f}, {high:.0f}]" for tier, (low, high) in more.items())
+    return sorted((low > 0) - (high < 0) for low, high in more.values()) == [-1, 0, 1], text
+
+
 def of_robots_asked(who: str, wins: int, losses: int = 0) -> Check:
     """What `flow` under `adapt` earns more than a clone under it, on the same resets of every robot's data."""
 
@@ -963,6 +974,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "earns more than a clone under the same guard on eight of nine data sets and less on none": BEST_OF_EIGHT,
         "**The first proposal alone** earns more on four of nine and less on two": FIRST_ALONE,
         "`full` from cloned actions earns more than that on most": of_climbing_robots,
+        "`flow` earns less on one of three and more on another of HalfCheetah's tiers than a clone": of_robot_pools,
         # choices of a guard
         "The World's error costs nothing": error_costs_nothing,
         "V alone, without ℓ": by_value_alone,

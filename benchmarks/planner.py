@@ -113,7 +113,7 @@ GROUPS: dict[str, dict[str, Any]] = {
     "algorithm1": {
         "tasks": SPREAD + POOLED + ROBOTS,
         "rows": {f"λ = {w:g}": ("icbf", "algorithm1", {"barrier_weight": w}) for w in (0.0, 0.1, 1.0, 10.0)},
-        "plays": ("as it is",),
+        "plays": ("as it is",),  # and of robots --plays "as it is" cool
     },
     "guards": {
         "tasks": SPREAD,

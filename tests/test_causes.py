@@ -296,8 +296,8 @@ def test_danger_may_grow_with_a_square_or_a_product():
     place, speed, turn = (rng.normal(0, size, (20_000, 2)) for size in (3.0, 1.5, 0.7))
     ahead = rng.uniform(0, 12, (20_000, 2))
     cases = {
-        "the square of own.vx": (["own.x", "own.vx"], (place, speed), place + 0.5 * speed * np.abs(speed) > 6),
-        "the square of own.v": (["own.gap", "own.v"], (ahead, np.abs(speed)), ahead < speed**2 / 3),
+        "the signed square of own.vx": (["own.x", "own.vx"], (place, speed), place + 0.5 * speed * np.abs(speed) > 6),
+        "the signed square of own.v": (["own.gap", "own.v"], (ahead, np.abs(speed)), ahead < speed**2 / 3),
         "|own.v times own.yaw_rate|": (["own.v", "own.yaw_rate"], (speed, turn), np.abs(speed * turn) > 2),
         "own.v times own.force": (["own.v", "own.force"], (speed, place), speed * place > 8),
     }

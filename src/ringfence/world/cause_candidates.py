@@ -76,9 +76,19 @@ def pairs(names: Sequence[str]) -> Iterator[Cause]:
         if len(vector) > 1 and len(one) < 3 and not set(one) & set(vector):
             entries = tuple(Entry((own[name],), name) for name in one)
             yield Cause((*entries, Length(tuple(Entry((own[name],), name) for name in vector))))
-    for product in _products(own):
+
+
+def products(names: Sequence[str]) -> Iterator[Cause]:
+    """Of oneself two entries times each other, and how far that is from 0: powers, or how hard one is thrown aside."""
+    for product in _products(_own(names)):
         yield Cause((product,))
         yield Cause((Length((product,)),))
+
+
+def _products(own: dict[str, int]) -> list[Quantity]:
+    entries = [Entry((d,), name) for name, d in own.items()]
+    both = list(itertools.combinations(entries, 2))
+    return [Product(each) for each in both] if len(both) <= MOST_PAIRS else []
 
 
 def of_several(names: Sequence[str]) -> Iterator[Cause]:
@@ -108,15 +118,9 @@ def _of_three(offset: tuple[Entry, ...]) -> Iterator[Cause]:
         yield Cause((Turned((one[0], one[1]), tuple(two), "angle"),))
 
 
-def _products(own: dict[str, int]) -> list[Quantity]:
-    entries = [Entry((d,), name) for name, d in own.items()]
-    both = list(itertools.combinations(entries, 2))
-    return [Product(each) for each in both] if len(both) <= MOST_PAIRS else []
-
-
-def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:
-    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are;
-    their squares, as of a way to stop, and products."""
+def beside(cause: Cause, names: Sequence[str], multiplied: bool = False) -> Iterator[Quantity]:
+    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are; and
+    what is `multiplied`: their squares, as of a way to stop, and products."""
     own, several = _own(names), things_of(names)
     found = _numbers("", [own])
     for kind, each in several.items():
@@ -125,8 +129,9 @@ def beside(cause: Cause, names: Sequence[str]) -> Iterator[Quantity]:
             found += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
             found += _closing(kind, each, axes, own) if axes else ()
     yield from found
-    yield from map(squared, found)
-    yield from _products(own)
+    if multiplied:
+        yield from map(squared, found)
+        yield from _products(own)
 
 
 def of_team(names: Sequence[str]) -> Iterator[Cause]:

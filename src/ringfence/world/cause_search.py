@@ -19,7 +19,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ringfence.problem.entries import Entries
-from ringfence.world.cause_candidates import beside, candidates, of_several, of_team, offsets, pairs, wider
+from ringfence.world.cause_candidates import beside, candidates, of_several, of_team, offsets, pairs, products, wider
 from ringfence.world.cause_counts import (
     Counted,
     Explained,
@@ -32,7 +32,7 @@ from ringfence.world.cause_counts import (
     within,
 )
 from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found, narrowed, only_of, only_where
-from ringfence.world.quantities import Entry, Length, Over, Product, Quantity, leaves
+from ringfence.world.quantities import Entry, Length, Over, Quantity, leaves
 from ringfence.world.rules import rules_of, tilted_of, weighted_of
 
 MOST = 8  # causes
@@ -116,11 +116,22 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
 def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str], team: bool) -> list[Counted]:
     """The causes, or those that are found with more that may be read, where these tell more. Aircraft are too near
     where they are near across and in height, vehicles where they are along and aside, or near and fast; what is ahead
-    is in danger, or what would meet soon; or who is fast in some place; and loads are the team's."""
+    is in danger, or what would meet soon; or who is fast in some place; and loads are the team's. What is multiplied
+    is read where all of these tell too little."""
     if _tell_enough(steps, chosen):
         return chosen
     several = [one for one in _about_whom(steps, of_several(names)) if _is_of_several(steps, one)]
     shapes = [*_about_whom(steps, pairs(names)), *several, *(_about_whom(steps, of_team(names)) if team else ())]
+    chosen = _told_by(steps, chosen, shapes, names, multiplied=False)
+    if _tell_enough(steps, chosen):
+        return chosen
+    return _told_by(steps, chosen, [*shapes, *_about_whom(steps, products(names))], names, multiplied=True)
+
+
+def _told_by(
+    steps: Steps, chosen: list[Counted], shapes: list[Cause], names: Sequence[str], multiplied: bool
+) -> list[Counted]:
+    """The causes, or those that are found with these shapes, where they tell more."""
     pool = [*_about_whom(steps, candidates(names)), *shapes]
     found = _added(steps, [], pool)
     if not _tell_enough(steps, found):  # some may hold for some agents alone
@@ -128,8 +139,8 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str],
         likely = sorted(shapes, key=lambda cause: -counted(steps, cause, nothing).gain)[:LIKELY]
         found = _added(steps, found, [one for cause in likely for one in only_of(cause, steps.x.shape[1])], PURE)
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
-    chosen = _as_rules(steps, chosen, shapes, names)
-    found = _as_rules(steps, found, shapes, names)
+    chosen = _as_rules(steps, chosen, shapes, names, multiplied)
+    found = _as_rules(steps, found, shapes, names, multiplied)
     if not _tell_enough(steps, found):  # exact ones leave more to tell than those that they were made of
         found = _pruned(steps, _added(steps, found, [one.cause for one in chosen]))
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
@@ -144,12 +155,14 @@ def _wrong_together(steps: Steps, chosen: list[Counted]) -> int:
     return int((np.logical_or.reduce([np.zeros(steps.unsafe.shape, bool), *called]) != steps.unsafe).sum())
 
 
-def _as_rules(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names: Sequence[str]) -> list[Counted]:
+def _as_rules(
+    steps: Steps, chosen: list[Counted], pool: Sequence[Cause], names: Sequence[str], multiplied: bool
+) -> list[Counted]:
     """The causes, those of several numbers as rules where these tell as much."""
     for k, one in enumerate(chosen):
         explained = _without(steps, chosen, one)
         best = _as_rule(steps, one, pool, explained) if one.cause.width > 1 else _among(steps, one, explained)
-        chosen = [*chosen[:k], _tilted(steps, best, names, explained), *chosen[k + 1 :]]
+        chosen = [*chosen[:k], _tilted(steps, best, names, explained, multiplied), *chosen[k + 1 :]]
     return _pruned(steps, chosen)
 
 
@@ -169,28 +182,33 @@ def _among(steps: Steps, one: Counted, explained: Explained) -> Counted:
     return best
 
 
-def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained) -> Counted:
+def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explained, multiplied: bool) -> Counted:
     """The cause with thresholds that depend on other numbers, or a sum over the team with weights, while these tell
-    clearly more: boxes as long as both are, limits that fall along a way."""
-    more = [one for one in beside(best.cause, names) if _varies(steps, one)]
-    plain = [one for one in more if not isinstance(one, Product)]
-    return _shifted(steps, _shifted(steps, best, plain, explained), more, explained)
+    clearly more: boxes as long as both are, limits that fall along a way. Plain numbers do before what is
+    multiplied."""
+    for also in (False, True)[: 1 + multiplied]:
+        more = [one for one in beside(best.cause, names, also) if _varies(steps, one)]
+        best = _shifted(steps, best, more, explained)
+    return best
 
 
 def _shifted(steps: Steps, best: Counted, more: Sequence[Quantity], explained: Explained) -> Counted:
     """The cause with thresholds that depend on some of these numbers, while it tells clearly more so."""
     least = NEEDLESS * steps.unsafe.sum()
-    while (before := _told_wrong(steps, best, explained)) > least:
+    before = _told_wrong(steps, best, explained)
+    while before > least:
         tried = [*weighted_of(steps, best, explained), *tilted_of(steps, best, explained, more)]
         found = [counted(steps, cause, explained) for cause in tried if cause != best.cause]
         enough = (1 - SIMPLER) * max((one.gain for one in found), default=0.0)
-        better = next((one for one in found if one.gain >= enough), best)
+        better = next((one for one in found if one.gain >= enough), None)
+        if better is None:
+            break
         gained, error = gain(steps, explained.beside(best), better.safe)
         lost = gain(steps, explained.beside(better), best.safe)[0]
-        less = before - _told_wrong(steps, better, explained)
-        if less <= max(SLANTED * before, least) or gained - lost <= SURE * error:
+        after = _told_wrong(steps, better, explained)
+        if before - after <= max(SLANTED * before, least) or gained - lost <= SURE * error:
             break
-        best = better
+        best, before = better, after
     return best
 
 

@@ -34,7 +34,7 @@ from ringfence.world.settings import Settings
 AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
 Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
 STATES = 20_000  # steps that features and their changes are standardised by
-BATCH = 64  # small and often: it learns contacts that larger ones, of fewer updates, do not
+BATCH = 64  # rows of each member: larger ones forecast slightly better, and guard no better
 
 
 class Heading(msgspec.Struct, frozen=True):

@@ -148,7 +148,9 @@ class Product(msgspec.Struct, frozen=True, tag=True):
     @property
     def words(self) -> str:
         one, other = self.parts
-        if other in (one, Length((one,))):
+        if other == Length((one,)):
+            return f"the signed square of {one.words}"
+        if other == one:
             return f"the square of {one.words}"
         return f"{one.words} times {other.words}"
 
@@ -194,14 +196,15 @@ class Over(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def words(self) -> str:
-        whose = "over the team" if self.axis == "team" else "over all"
+        kind = self.part.words.strip("|").split(".")[0]
+        some = ", ".join(f"{kind}{j}" for j in self.among)
+        whose = "over the team" if self.axis == "team" else f"over {some or 'all'}"
         if self.weights:
             return f"sum of {self.part.words} times {', '.join(f'{w:.3g}' for w in self.weights)} {whose}"
         if not self.rank:
             return f"sum of {self.part.words} {whose}"
         if self.axis == "things" and self.part.words.endswith(".distance"):
-            kind = self.part.words.removesuffix(".distance")
-            among = f" among {', '.join(f'{kind}{j}' for j in self.among)}" if self.among else ""
+            among = f" among {some}" if some else ""
             return f"{self.part.words} of the {ORDINALS[self.rank - 1]}nearest{among}"
         return f"{ORDINALS[self.rank - 1]}lowest {self.part.words} {whose}"
 

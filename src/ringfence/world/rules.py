@@ -66,17 +66,12 @@ def rules_of(steps: Steps, one: Counted, explained: Explained) -> Iterator[Cause
     units = scale[sides[0].number] / scale if sides else scale
     if len(sides) > 1:
         yield _reading(cause, All(tuple(_condition(cause.reads, side, scale, units) for side in sides)))
-    if cause.width == 2:
-        for squares in ((), (1,), (0,)):
-            values, reads, units = read.values.copy(), list(cause.reads), scale.copy()
-            for k in squares:
-                values[..., k] *= abs(values[..., k])
-                reads[k], units[k] = squared(reads[k]), units[k] ** 2
-            line = _line(replace(read, values=values), one.cells)
-            if line is not None:
-                sign, weight, at = line
-                weights = sign[0], float(sign[1] * weight * units[0] / units[1])
-                yield _reading(cause, Sum(tuple(reads), weights, -float(at * units[0])))
+    line = _best_line(read, steps, one, explained) if cause.width == 2 else None
+    if line is not None:
+        reads = tuple(squared(each) if k == line.squared else each for k, each in enumerate(cause.reads))
+        units = [unit**2 if k == line.squared else unit for k, unit in enumerate(scale)]
+        weights = line.signs[0], float(line.signs[1] * line.weight * units[0] / units[1])
+        yield _reading(cause, Sum(reads, weights, -float(line.at * units[0])))
 
 
 def _reading(cause: Cause, read: Quantity) -> Cause:
@@ -360,22 +355,48 @@ def _condition(reads: Sequence[Quantity], side: _Side, scale: np.ndarray, units:
     return Sum((reads[side.number],), (weight,), -float(side.at * scale[side.number] * units[side.number]))
 
 
-def _line(read: _Read, cells: Cells) -> tuple[tuple[float, float], float, float] | None:
-    """(signs, weight of the second number, where danger begins) of the line that tells fewest steps wrongly, towards
-    where danger is."""
+@dataclass(frozen=True)
+class _Line:
+    """A condition of two numbers: the first and so many times the second, each times a sign, are below `at`."""
+
+    wrong: int  # steps that it tells wrongly
+    signs: tuple[float, float]
+    weight: float
+    at: float
+    squared: int | None  # which of the two is squared
+
+
+def _best_line(read: _Read, steps: Steps, one: Counted, explained: Explained) -> _Line | None:
+    """The line that tells fewest steps wrongly: of both numbers as they are, or of one's square, where some steps say
+    that this tells more."""
+    some = _read(steps, one, explained, SCREENED)[0]
+    lines = [line for k in (None, 1, 0) if (line := _line(some, one.cells, k)) is not None]
+    if not lines:
+        return None
+    plain, *squares = lines
+    best = min(squares, key=lambda line: line.wrong)
+    clearly = best.wrong < plain.wrong - NEEDLESS * some.bad.sum()
+    return _line(read, one.cells, best.squared if clearly else None)
+
+
+def _line(read: _Read, cells: Cells, squared: int | None) -> _Line | None:
+    """The line that tells fewest steps wrongly, towards where danger is; of the square of one number."""
     centres, unsafe = cells.known()
     if unsafe.all() or not unsafe.any():
         return None
     toward = centres[unsafe].mean(0) - centres[~unsafe].mean(0)
-    sign = (1.0 if toward[0] < 0 else -1.0), (1.0 if toward[1] < 0 else -1.0)
-    one, two = sign[0] * read.values[..., 0], sign[1] * read.values[..., 1]
-    weight, at = 1.0, 0.0
+    signs = (1.0 if toward[0] < 0 else -1.0), (1.0 if toward[1] < 0 else -1.0)
+    one, two = (
+        sign * (values * abs(values) if k == squared else values)
+        for k, (sign, values) in enumerate(zip(signs, np.moveaxis(read.values, -1, 0)))
+    )
+    weight, found, best = 1.0, [(0, 0.0)], 0
     for factor, either in zip(RATIOS, TRIED):
         tried = [weight * factor**k for k in range(-either, either + 1)]
         found = [read.parted(one + np.float32(w) * two) for w in tried]
         best = _middle_of_best(found)
-        weight, at = tried[best], found[best][1]
-    return sign, weight, at
+        weight = tried[best]
+    return _Line(found[best][0], signs, weight, found[best][1], squared)
 
 
 def _middle_of_best(found: Sequence[tuple[int, float]]) -> int:
