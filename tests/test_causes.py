@@ -25,10 +25,8 @@ from ringfence.world import (
     cause_search,
     causes,
     judging,
-    load,
     margins,
     probes,
-    save,
     verdict,
 )
 from ringfence.world.card import (
@@ -45,7 +43,6 @@ from ringfence.world.card import (
 )
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Cells, Edge, Found
-from ringfence.world.dynamics import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
 from ringfence.world.quantities import Entry, Length
 from tests.quick import IN_FULL, QUICK_WORLD
@@ -632,45 +629,6 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
     older = dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=Data("walks", {})))
     with pytest.raises(UserError, match="within_logs needs a World that says what its logs have shown.*; fit it again"):
         guard(lambda seen, state: out, older, guard="shield", within_logs=True)
-
-
-def test_who_never_went_backwards_is_not_predicted_to():
-    """Nobody brakes at rest in logs of cars, so networks do not learn that they stay where they are."""
-    heading = Heading((0, 1), (2, 3))
-    assert Heading.of(["own.vx", "own.vy", "own.cos", "own.sin"]) == heading
-    assert Heading.of(["own.speed", "own.cos", "own.sin"]) == Heading((0,), (1, 2))
-    assert Heading.of(["own.vx", "own.vy"]) is None
-    seeing = Heading.of(["own.v", "own.cos", "own.sin", "thing_a.dvy", "own.dvx", "other1.dvx", "other1.dx"])
-    assert seeing == Heading((0,), (1, 2), ((3, 1), (5, 0)))
-    moved = seeing.no_slower(jnp.array([-1.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0]), 0.0)
-    np.testing.assert_allclose(moved, [0, 0.6, 0.8, -0.8, 0, -0.6, 0], atol=1e-6)
-    back = jnp.array([[-0.6, -0.8, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]])
-    np.testing.assert_allclose(heading.no_slower(back, 0.0), [[0, 0, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]], atol=1e-6)
-    np.testing.assert_allclose(heading.no_slower(back, -0.5)[0, :2], [-0.3, -0.4], atol=1e-6)
-    np.testing.assert_allclose(Heading((0,), (1, 2)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
-
-
-def test_a_car_that_brakes_at_rest_stays(tmp_path):
-    """In logs of who never does so. What a file holds is the same World."""
-    rng = np.random.default_rng(0)
-    turn = rng.uniform(-np.pi, np.pi, (12, 1, N)).repeat(31, 1)
-    action = rng.uniform(-1, 1, (12, 30, N, 2)).astype(np.float32)
-    speed = np.zeros((12, 31, N))
-    for t in range(30):
-        action[:, t, :, 0] = np.where(speed[:, t] < 0.3, np.abs(action[:, t, :, 0]), action[:, t, :, 0])
-        speed[:, t + 1] = np.maximum(speed[:, t] + 0.2 * action[:, t, :, 0], 0.0)
-    seen = np.stack([speed * np.cos(turn), speed * np.sin(turn), np.cos(turn), np.sin(turn)], -1)
-    names = ["own.vx", "own.vy", "own.cos", "own.sin"]
-    card = {"task": "cars", "observation_names": names, "dt": 0.2, "homogeneous": True}
-    store = EpisodeStore.from_episodes(seen, action, np.zeros((12, 30)), (speed[:, 1:] > 1.5) * 1.0, card=card)
-    made = fit(store, **QUICK_WORLD)
-    assert made.dynamics.ahead == (Heading((0, 1), (2, 3)), pytest.approx(0.0))
-    rest = jnp.array([[[0.0, 0.0, 1.0, 0.0]]])
-    brake = jnp.array([[[-1.0, 0.0]]])
-    free = dataclasses.replace(made.dynamics, ahead=None)
-    assert free.step(rest, brake)[0][0, 0, 0] < -0.02 and made.dynamics.step(rest, brake)[0][0, 0, 0] > -1e-5
-    again = load(save(made, tmp_path / "w.safetensors"))
-    assert again.dynamics.ahead == made.dynamics.ahead
 
 
 def test_answers_are_drawn_on_the_page_of_a_fit(fitted, tmp_path):

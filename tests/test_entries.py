@@ -14,7 +14,7 @@ from ringfence.problem.entries import Entries, Entry, Names, axes_of
 from ringfence.problem.features import FeatureMap, constant_velocity, derived, from_data, headed, others_offsets
 from ringfence.world import cause_candidates
 from ringfence.world.barrier import shape_of
-from ringfence.world.dynamics import Heading
+from ringfence.world.stops import Heading
 
 FIELDS = ("d{0}", "d{1}", "dv{0}", "dv{1}")
 OWN = ("{0}", "{1}", "v{0}", "v{1}")
@@ -75,7 +75,6 @@ def test_who_looks_into_a_direction_sees_things_ahead_and_aside(looks):
     assert (heading is None) == (len(looks) == 1)
     if heading is not None:
         assert heading.velocity == (2, 3) and heading.direction == (4, 5)
-        assert heading.relative == ((8, 0), (9, 1), (12, 0), (13, 1))
     alone = tuple(name for name in names if not name.startswith("own.v")) + ("own.v",)
     assert headed(alone) == (() if heading is None else ((12, 2), (12, 3)))
 

@@ -24,6 +24,7 @@ from ringfence.world import World
 from ringfence.world.barrier import Barrier, soft
 from ringfence.world.cause_nets import CauseNet, Distance, Score
 from ringfence.world.dynamics import Dynamics
+from ringfence.world.stops import Bounds, Heading
 
 EXACT = ("seen",)  # entries that are no measurements, by the ends of their names
 ROUNDING = 1e-5  # share of what is summed that single precision may lose
@@ -34,6 +35,17 @@ class Box(NamedTuple):
 
     center: Array
     radius: Array
+
+
+def _ends_of(begun: Box, change: Box) -> tuple[Array, Array]:
+    """(least, most) that is within one box and a change of it."""
+    center, radius = begun.center + change.center, begun.radius + change.radius
+    return center - radius, center + radius
+
+
+def _widened(box: Box, low: Array, high: Array) -> Box:
+    """The box, of what has between `low` (0 or less) and `high` (0 or more) added to it."""
+    return Box(box.center + (low + high) / 2, box.radius + (high - low) / 2)
 
 
 class Motion(NamedTuple):
@@ -60,7 +72,7 @@ class Prover(eqx.Module):
         shared = all(len(net.weights[0]) == 1 for net in ([] if barrier is None else _networks(barrier)))
         known = isinstance(barrier, Barrier) and not barrier.shape.use_transition and not barrier.shape.joint
         dynamics = self.world.dynamics
-        linear = dynamics.guesses is None and dynamics.ahead is None and not dynamics.map.turns
+        linear = dynamics.guesses is None and Heading.of(dynamics.map.names) is None and not dynamics.map.turns
         if self.world.map.dt is None or not known or not shared or not linear:
             raise UserError(
                 "proof is of Worlds of homogeneous agents without a heading or angles, whose danger is one and of "
@@ -194,8 +206,25 @@ class Prover(eqx.Module):
         half = half + (jnp.abs(slope) * own_spread[..., None, :]).sum(-1)
         both = jnp.abs(jnp.eye(len(motion.own)) + slope)
         half = half + (both * change.radius[..., None, :]).sum(-1) + self.residual
-        middle = middle + change.center
-        return Box(middle, half + ROUNDING * (jnp.abs(middle) + 1.0))
+        begun = Box(now.center[..., motion.own] - change.center, own_spread)
+        later = self._stopped(begun, Box(middle + change.center, half))
+        return Box(later.center, later.radius + ROUNDING * (jnp.abs(later.center) + 1.0))
+
+    def _stopped(self, begun: Box, change: Box) -> Box:
+        """The change of an own velocity, which was within `begun`, as stops leave it."""
+        dynamics = self.world.dynamics
+        own = motion_of(dynamics.map).own
+        low, high, fastest = Bounds.of(dynamics.stops, dynamics.map, 1)  # of homogeneous agents
+        low, high = low[0, own], high[0, own]
+        if np.isfinite(low).any() or np.isfinite(high).any():
+            least, most = _ends_of(begun, change)
+            change = _widened(change, jnp.minimum(high - most, 0.0), jnp.maximum(low - least, 0.0))
+        if np.isfinite(fastest[0]):
+            least, most = _ends_of(begun, change)
+            size = jnp.sqrt((jnp.maximum(-least, most) ** 2).sum(-1, keepdims=True))
+            slower = 1.0 - fastest[0] / jnp.maximum(size, fastest[0])  # the share that is lost, at most
+            change = _widened(change, -slower * jnp.maximum(most, 0.0), -slower * jnp.minimum(least, 0.0))
+        return change
 
 
 def motion_of(map: FeatureMap) -> Motion:

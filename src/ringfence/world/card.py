@@ -15,6 +15,7 @@ from ringfence.utils.config import build_config
 from ringfence.utils.text import percent, significant
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.settings import Settings
+from ringfence.world.stops import AHEAD, Stop
 
 FARTHEST = 15  # rows that a guard looks ahead by itself (benchmarks/proving.py plays more of them)
 JUDGED = 3  # steps ahead that the margin is calibrated for
@@ -55,6 +56,7 @@ class Data(Part, frozen=True):
     late: tuple[int | None, ...] = ()  # steps after which commands of each agent take effect, where not at once
     agents: list[str] | None = None  # their names, in order, where these say more than numbers do
     partners: bool = False  # predictions read what those do who are in lists of the nearest (problem/partners.py)
+    stops: tuple[Stop, ...] = ()  # what nobody passes (world/stops.py)
 
 
 class HeldOut(Part, frozen=True):
@@ -289,6 +291,9 @@ def _of_data(card: Card) -> Iterator[str]:
         yield f"Entries are read less one's own, too: {', '.join(apart[:LISTED])}{more}."
     if card.data.partners:
         yield "Who is in lists of the nearest is found by what two see of each other; predictions read what these do."
+    if stops := [stop.words for stop in card.data.stops if stop.name != AHEAD]:
+        more = f" and {len(stops) - LISTED} more" if len(stops) > LISTED else ""
+        yield f"What logs reach and never pass, nobody is predicted to pass: {', '.join(stops[:LISTED])}{more}."
     if card.data.impacts:
         yield (
             f"In {card.data.impacts} unsafe steps a body was thrown back by what it touched: danger is where it would "

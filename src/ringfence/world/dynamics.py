@@ -8,81 +8,30 @@ It is fitted long enough to learn contacts. A few thousand updates predict free 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 import optax
 
 from ringfence.nets.layers import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem import partners
-from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.motion import pointing, within
 from ringfence.problem.normalise import varying
 from ringfence.problem.partners import others
 from ringfence.types import Array, Key
 from ringfence.utils.precision import on_device
+from ringfence.world import stops
 from ringfence.world.settings import Settings
+from ringfence.world.stops import Stop
 
-AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
 Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
 STATES = 20_000  # steps that features and their changes are standardised by
 BATCH = 64  # rows of each member: larger ones forecast slightly better, and guard no better
-
-
-class Heading(msgspec.Struct, frozen=True):
-    """Entries that tell how fast a body that looks into a direction goes ahead: its velocity, or its speed, and that
-    direction."""
-
-    velocity: tuple[int, ...]  # two, or the speed
-    direction: tuple[int, int]
-    relative: tuple[tuple[int, int], ...] = ()  # velocities of things less one's own, and along which axis
-
-    @classmethod
-    def of(cls, names: Sequence[str]) -> Heading | None:
-        """None where names tell of none."""
-        known = Entries.of(names)
-        if len(known.direction) < 2:
-            return None
-        cos, sin = known.direction
-        axes = known.axes[:2]
-        drifts = [e for e in known.each if e.role == "drift" and e.whose != "own" and e.axis in axes]
-        relative = tuple((e.source, axes.index(e.axis)) for e in drifts)
-        if velocity := known.pair("v{}"):
-            return cls(velocity, (cos, sin), relative)
-        return None if known.speed is None else cls((known.speed,), (cos, sin), relative)
-
-    @property
-    def about(self) -> tuple[int, ...]:
-        """Entries that are relative to the velocity."""
-        return tuple(entry for entry, _ in self.relative)
-
-    def speed(self, x: Any) -> Any:
-        """(...) ahead, of features (..., D), NumPy's or JAX's: negative of who goes backwards."""
-        if len(self.velocity) == 1:
-            return x[..., self.velocity[0]]
-        cos, sin = (x[..., d] for d in self.direction)
-        vx, vy = (x[..., v] for v in self.velocity)
-        return (vx * cos + vy * sin) / (cos**2 + sin**2 + 1e-9) ** 0.5
-
-    def no_slower(self, x: Array, least: float) -> Array:
-        """Features (..., D) with that speed ahead at least, and what is relative to it as much less."""
-        lacks = jnp.maximum(least - self.speed(x), 0.0)[..., None]
-        direction = x[..., np.array(self.direction)]
-        length = jnp.sqrt((direction**2).sum(-1, keepdims=True) + 1e-9)
-        faster = lacks * direction / length
-        x = x.at[..., np.array(self.velocity)].add(faster if len(self.velocity) == 2 else lacks)
-        if not self.relative:
-            return x
-        axes = np.array([axis for _, axis in self.relative])
-        return x.at[..., np.array(self.about)].add(-faster[..., axes])
 
 
 class Dynamics(eqx.Module):
@@ -103,9 +52,7 @@ class Dynamics(eqx.Module):
     step_mean: Array  # (F,) of the predicted entries
     step_scale: Array  # (F,) 0 of entries that never change within an episode
     map: FeatureMap = eqx.field(static=True)
-    # Bodies that look ahead go no slower than that, e.g. backwards: nobody brakes at rest in logs of cars, so networks
-    # do not learn that they stay where they are.
-    ahead: tuple[Heading, float] | None = eqx.field(static=True, default=None)
+    stops: tuple[Stop, ...] = eqx.field(static=True, default=())  # what nobody passes
 
     @property
     def predicted(self) -> np.ndarray:
@@ -169,22 +116,14 @@ class Dynamics(eqx.Module):
         """Features (..., N, D) after a standardised change (..., N or 1, F)."""
         moved = change * self.step_scale + self.step_mean
         if self.map.joint:
-            after = within(self.map.turns, before[..., 0, :] + moved[..., 0, :])
-            return after[..., _of_first(self.map)]
+            first = before[..., :1, :]
+            after = within(self.map.turns, stops.held(self.stops, self.map, first, first + moved))
+            return after[..., 0, :][..., _of_first(self.map)]
         after = before.at[..., self.predicted].add(moved)
-        if self.ahead is not None:
-            heading, least = self.ahead
-            after = heading.no_slower(after, least)
+        after = stops.held(self.stops, self.map, before, after)
         if self.map.reconcile is not None:
             after = self.map.reconcile(jnp.stack([before, after], -3))[..., 1, :, :]
         return within(self.map.turns, after)
-
-
-def slowest(map: FeatureMap, ranges: Mapping[str, tuple[float, float]] | None) -> tuple[Heading, float] | None:
-    """How slowly bodies of a view go ahead by the ranges of a World's card; None of bodies that look nowhere."""
-    heading = None if map.joint else Heading.of(map.names)
-    speeds = (ranges or {}).get(AHEAD)
-    return None if heading is None or speeds is None else (heading, min(speeds[0], 0.0))
 
 
 def fit_dynamics(

@@ -30,12 +30,11 @@ from ringfence.utils.precision import on_device
 from ringfence.utils.progress import Parts
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
-from ringfence.world import cause_search, dynamics, impacts, judging, margins, values
+from ringfence.world import cause_search, dynamics, impacts, judging, margins, stops, values
 from ringfence.world.card import Card, Data, Settings
 from ringfence.world.cause_candidates import offsets
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import Cells, Found
-from ringfence.world.dynamics import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World, blank_world
 
@@ -158,12 +157,14 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
     if map.mirrored:
         acts = _with_partners(acts, logged, steps, moved, of)
         moved.append(acts.map.mirrored)
+    acts = dataclasses.replace(acts, stops=_stops(logged, steps, acts.predicted))
+    moved.append(acts.stops)
     if thrown:
         logged = impacts.landed(logged, acts)
     barrier, causes = _barrier(logged, tuple(labels), moved, acts, of)
     card = Card(
         format=FORMAT,
-        data=_data(store, logged, thrown, bool(acts.map.mirrored)),
+        data=_data(store, logged, thrown, acts),
         settings=settings,
         seed=of.seed,
         shape=_shape_in_words(barrier),
@@ -173,7 +174,7 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
     return world, logged, as_they_are
 
 
-def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> Data:
+def _data(store: EpisodeStore, logged: Logged, thrown: int, acts: dynamics.Dynamics) -> Data:
     """What the card says of the logs."""
     several = logged.several
     delays = late.lateness(store)
@@ -195,8 +196,15 @@ def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> 
         action_delay=store.card.action_delay,
         late=delays.steps if delays.any else (),
         agents=_agents(store),
-        partners=looked_up,
+        partners=bool(acts.map.mirrored),
+        stops=acts.stops,
     )
+
+
+def _stops(logged: Logged, steps: np.ndarray, predicted: np.ndarray) -> tuple[stops.Stop, ...]:
+    safe = ~logged.unsafe[steps] if logged.labels else np.ones(len(steps), bool)
+    moves = logged.before(steps), logged.after(steps), logged.picked("actions", steps)
+    return stops.found(logged.map, predicted, moves, safe, logged.store.card.homogeneous)
 
 
 def _agents(store: EpisodeStore) -> list[str] | None:
@@ -224,9 +232,6 @@ def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:
     for cause in offsets(names):
         length = cause.of(x)
         found[cause.name] = (float(length.min()), float(length.max()))
-    if (heading := Heading.of(names)) is not None:
-        speed = heading.speed(x)
-        found[AHEAD] = (float(speed.min()), float(speed.max()))
     return found
 
 

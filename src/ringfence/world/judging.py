@@ -33,7 +33,7 @@ from ringfence.world.card import (
     ValueScores,
 )
 from ringfence.world.causes import Cause, Edge
-from ringfence.world.dynamics import Dynamics, slowest
+from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 from ringfence.world.margins import (
     OUTLIERS,
@@ -115,9 +115,8 @@ def judged(world: World, logged: Logged, whole: Logged, judging: Judging) -> Wor
         barrier=scores,
         constraints=constraints,
     )
-    acts = dataclasses.replace(world.dynamics, ahead=slowest(world.map, card.data.ranges))
     threshold = jnp.asarray(ood.threshold, jnp.float32)
-    return dataclasses.replace(world, dynamics=acts, barrier=barrier, ood_threshold=threshold, card=card)
+    return dataclasses.replace(world, barrier=barrier, ood_threshold=threshold, card=card)
 
 
 # --- predictions ---

@@ -89,7 +89,7 @@ def blank_world(
         moving = map if card is not None and card.data.partners else replace(map, mirrored=())
         acts = dynamics.blank_dynamics(moving, spec.action_dim, settings.num_ensemble, settings.dynamics_width)
         if card is not None:
-            acts = replace(acts, ahead=dynamics.slowest(map, card.data.ranges))
+            acts = replace(acts, stops=card.data.stops)
         value = values.blank_values(map, spec.action_dim, settings.discount, settings.alone)
         causes = card.causes if card else {}
         names = tuple(constraints)
