@@ -15,6 +15,8 @@ from ringfence.loading.resolve import load as load_run
 from ringfence.problem.features import FeatureMap
 from ringfence.training.worlds import fit
 from ringfence.world import load, save, stops
+from ringfence.world.dynamics import fit_dynamics
+from ringfence.world.settings import Settings
 from ringfence.world.stops import AHEAD, SPEED, Heading, Stop
 from tests.quick import QUICK_WORLD
 
@@ -102,6 +104,26 @@ def test_nobody_goes_beyond_a_stop():
     assert stops.held((), map, before, after) is after
     slope = jax.grad(lambda x: stops.held(known, map, before, x).sum())(jnp.zeros_like(after))
     assert np.isfinite(slope).all(), "at rest, too"
+
+
+def test_networks_are_not_slow_before_a_stop():
+    """Taught that a stop is no law of theirs, they err less next to it: a smooth bend would begin before it."""
+    names, steps = logged(lambda x, action: np.clip(x + 0.3 * action[..., :1], -0.8, 0.8), ["own.v"], steps=50)
+    features = np.stack(steps[:2], 1).reshape(-1, N, 1)
+    row = jnp.arange(0, len(features), 2)
+    settings = Settings(num_ensemble=2, dynamics_updates=600, dynamics_width=16)
+    errors = []
+    for known in ((), (Stop("own.v", -0.8, 0.8),)):
+        given = jnp.asarray(features), jnp.asarray(steps[2]), row, view(names), jax.random.key(0), settings
+        model = fit_dynamics(*given, known)
+        before = jnp.full((9, N, 1), 0.6)
+        action = jnp.linspace(0.1, 0.6, 9)[:, None, None] * jnp.ones((1, N, 2))
+        after, _ = model.step(before, action)
+        errors.append(float(jnp.abs(after - (before + 0.3 * action[..., :1])).max()))
+        pressed = model.step(jnp.full((9, N, 1), 0.8), action)[1]
+        if known:
+            assert float(pressed.max()) < 0.05, "who presses on is not out of distribution"
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_who_never_went_backwards_is_not_predicted_to():

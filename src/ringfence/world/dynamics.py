@@ -63,7 +63,7 @@ class Dynamics(eqx.Module):
         """Features (..., N, D) after actions (..., N, A) in [−1, 1], the mean over members, and how far these are
         apart (..., N): the root mean square over entries of their deviation, in units of a usual step."""
         change = self.changes(before, action)
-        spread = jnp.sqrt((change.var(0)).mean(-1) + 1e-12)
+        spread = jnp.sqrt((self.stopped(before, change).var(0)).mean(-1) + 1e-12)
         after = self.arrived(before, change.mean(0))
         return after, jnp.broadcast_to(spread, after.shape[:-1])
 
@@ -114,20 +114,38 @@ class Dynamics(eqx.Module):
 
     def arrived(self, before: Array, change: Array) -> Array:
         """Features (..., N, D) after a standardised change (..., N or 1, F)."""
-        moved = change * self.step_scale + self.step_mean
+        after = self._led(before, change)
         if self.map.joint:
-            first = before[..., :1, :]
-            after = within(self.map.turns, stops.held(self.stops, self.map, first, first + moved))
-            return after[..., 0, :][..., _of_first(self.map)]
-        after = before.at[..., self.predicted].add(moved)
-        after = stops.held(self.stops, self.map, before, after)
+            return within(self.map.turns, after)[..., 0, :][..., _of_first(self.map)]
         if self.map.reconcile is not None:
             after = self.map.reconcile(jnp.stack([before, after], -3))[..., 1, :, :]
         return within(self.map.turns, after)
 
+    def _led(self, before: Array, change: Array) -> Array:
+        """Features (..., N or 1, D) whose predicted entries change so, as far as nothing stops them."""
+        before = before[..., :1, :] if self.map.joint else before
+        moved = change * self.step_scale + self.step_mean
+        return stops.held(self.stops, self.map, before, before.at[..., self.predicted].add(moved))
+
+    def stopped(self, before: Array, change: Array) -> Array:
+        """The standardised change (..., N or 1, F) that is left of one. What goes beyond a stop is no error: networks
+        would be slow before it."""
+        if not self.stops:
+            return change
+        before = jnp.broadcast_to(before, (*change.shape[:-2], *before.shape[-2:]))
+        moved = self._led(before, change) - (before[..., :1, :] if self.map.joint else before)
+        moved = moved[..., self.predicted] - self.step_mean
+        return jnp.where(self.step_scale > 0, moved / jnp.maximum(self.step_scale, 1e-30), change)
+
 
 def fit_dynamics(
-    features: Array, actions: Array, row: Array, map: FeatureMap, key: Key, settings: Settings
+    features: Array,
+    actions: Array,
+    row: Array,
+    map: FeatureMap,
+    key: Key,
+    settings: Settings,
+    stops: tuple[Stop, ...] = (),
 ) -> Dynamics:
     """The ensemble of a data set: features (M, N, D); actions (T, N, A) of the T steps, each from row `row` (T,) to the
     next. The loss is Huber's, in standard deviations of the step: it keeps the kicks of contacts, which dwarf
@@ -141,7 +159,7 @@ def fit_dynamics(
     before = states[some].reshape(-1, states.shape[-1]).astype(np.float64)
     after = states[some + 1].reshape(before.shape).astype(np.float64)
     shape = map, actions.shape[-1], members, settings.dynamics_width
-    model = _standardised(blank_dynamics(*shape), before, after)
+    model = _standardised(replace(blank_dynamics(*shape), stops=stops), before, after)
     nets = _networks(key_nets, *shape)
     whose = others(map.plus.shape[0])
 
@@ -155,7 +173,8 @@ def fit_dynamics(
             theirs = read[:, whose].reshape(*read.shape[:2], -1)
             wrong = ((model.guessed(guesses, before) - theirs) ** 2).mean()
             read = jnp.concatenate([read, theirs], -1)
-        return optax.losses.huber_loss(net(read), moved, delta=1.0).mean() + wrong
+        change = model.stopped(before, net(read))
+        return optax.losses.huber_loss(change, moved, delta=1.0).mean() + wrong
 
     def loss(nets: tuple[MLP, MLP | None], data: tuple[Array, ...], pick: Array) -> Array:
         features, actions, row, *seen = data

@@ -153,12 +153,12 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
     if thrown:
         steps = steps[~logged.unsafe[steps]]
         moved.append(_digest(logged.unsafe))
-    acts = _dynamics(logged, steps, moved, blank.dynamics, of)
+    ends = _stops(logged, steps, blank.dynamics.predicted)
+    moved.append(ends)
+    acts = _dynamics(logged, steps, moved, dataclasses.replace(blank.dynamics, stops=ends), of)
     if map.mirrored:
         acts = _with_partners(acts, logged, steps, moved, of)
         moved.append(acts.map.mirrored)
-    acts = dataclasses.replace(acts, stops=_stops(logged, steps, acts.predicted))
-    moved.append(acts.stops)
     if thrown:
         logged = impacts.landed(logged, acts)
     barrier, causes = _barrier(logged, tuple(labels), moved, acts, of)
@@ -261,7 +261,8 @@ def _dynamics(
 
     def fit(key: Key) -> dynamics.Dynamics:
         actions, row = (on_device(logged.picked(name, steps)) for name in ("actions", "row"))
-        return dynamics.fit_dynamics(logged.arrays["features"], actions, row, blank.map, key, of.settings)
+        features = logged.arrays["features"]
+        return dynamics.fit_dynamics(features, actions, row, blank.map, key, of.settings, blank.stops)
 
     return of.part("dynamics", moved, blank, fit)
 
@@ -273,6 +274,7 @@ def _with_partners(
     than plain ones: in long lists they learn by heart who does what."""
     action = logged.arrays["actions"].shape[-1]
     blank = dynamics.blank_dynamics(logged.map, action, of.settings.num_ensemble, of.settings.dynamics_width)
+    blank = dataclasses.replace(blank, stops=plain.stops)
     told = _dynamics(logged, steps, [*moved, logged.map.mirrored], blank, of)
     asked = judging.JUDGING
     errors = [judging.prediction_error(each, logged, np.random.default_rng(4), asked) for each in (told, plain)]
