@@ -911,7 +911,7 @@ def test_foresight_is_of_what_the_barrier_reads(fitted):
     read = {one.name: one for one in fitted.card.prediction_error.read}
     assert set(read) == {"own.v", *(n for n in read if "own.x" in n), "length of other.dx, other.dy, of the nearest"}
     near = read["length of other.dx, other.dy, of the nearest"]
-    assert near.steps_ahead == (1, 3, 8) and near.seconds == ()
+    assert near.steps_ahead == (1, 3, 5, 10, 15) and near.seconds == ()
     assert near.error[0] < near.coasting[0] and near.beats_coasting
 
 
@@ -939,10 +939,11 @@ def test_constant_velocity_is_that_of_the_names():
 
 
 def test_foresight_is_told_in_seconds_where_logs_say_how_long_a_step_is():
-    world = fit(store_of(60, dt=0.25), **QUICK_WORLD)
-    assert world.card.data.dt == 0.25
+    """Of as many rows, since these are what guards look at."""
+    world = fit(store_of(60, dt=20.0), **QUICK_WORLD)
+    assert world.card.data.dt == 20.0
     for one in world.card.prediction_error.read:
-        assert one.steps_ahead == (4, 8) and one.seconds == (1.0, 2.0)
+        assert one.steps_ahead == (1, 3, 5, 10, 15) and one.seconds == (20.0, 60.0, 100.0, 200.0, 300.0)
 
 
 def test_episodes_with_danger_are_held_out_like_the_others():

@@ -72,6 +72,10 @@ def test_a_speed_that_is_limited_is_found():
     ]
     assert found(*logged(limited([1.5, 1.5]), velocity)) == ["own speed at 1.5"]
     assert found(*logged(limited([1.5, 1.5]), velocity), alike=True) == ["own speed at 1.5"]
+    assert found(*logged(limited([1.5, 99.0]), velocity)) == ["own speed of agent 0 at 1.5"]
+    square = lambda x, action: np.clip(x + 0.5 * action, -0.8, 0.8)  # noqa: E731
+    each = found(*logged(square, velocity))
+    assert each == ["own.vx at -0.8 and 0.8", "own.vy at -0.8 and 0.8"], "a corner is no limit of its own"
     assert found(*logged(limited([1.5, 0.9]), velocity), alike=True) == [], "of agents who are alike the fastest counts"
 
 
@@ -102,6 +106,8 @@ def test_nobody_goes_beyond_a_stop():
     np.testing.assert_allclose(x[0], [[1, 1.5, 2, -1.5, -2], [2, 1.5, 2, -1.5, -2]], rtol=1e-5)
     assert np.allclose(np.linalg.norm(x[2, :, 1:3], axis=-1), 3.0, rtol=1e-5), "no faster than it was"
     assert stops.held((), map, before, after) is after
+    one = np.asarray(stops.held((Stop(SPEED, None, 2.5, 1),), map, before, after))
+    assert np.array_equal(one[0, 0], after[0, 0]) and np.allclose(one[0, 1, 1:3], [1.5, 2.0]), "nothing stops the first"
     slope = jax.grad(lambda x: stops.held(known, map, before, x).sum())(jnp.zeros_like(after))
     assert np.isfinite(slope).all(), "at rest, too"
 

@@ -24,7 +24,7 @@ from ringfence.world import World
 from ringfence.world.barrier import Barrier, soft
 from ringfence.world.cause_nets import CauseNet, Distance, Score
 from ringfence.world.dynamics import Dynamics
-from ringfence.world.stops import Bounds, Heading
+from ringfence.world.stops import NONE, Bounds, Heading
 
 EXACT = ("seen",)  # entries that are no measurements, by the ends of their names
 ROUNDING = 1e-5  # share of what is summed that single precision may lose
@@ -219,7 +219,7 @@ class Prover(eqx.Module):
         if np.isfinite(low).any() or np.isfinite(high).any():
             least, most = _ends_of(begun, change)
             change = _widened(change, jnp.minimum(high - most, 0.0), jnp.maximum(low - least, 0.0))
-        if np.isfinite(fastest[0]):
+        if fastest[0] < NONE:
             least, most = _ends_of(begun, change)
             size = jnp.sqrt((jnp.maximum(-least, most) ** 2).sum(-1, keepdims=True))
             slower = 1.0 - fastest[0] / jnp.maximum(size, fastest[0])  # the share that is lost, at most

@@ -330,8 +330,8 @@ def _of_foresight(read: tuple[Foresight, ...]) -> Iterator[str]:
     shown += [one for one in order if one not in shown][:SHOWN]
     for one in shown:
         when = [f"{s:g} s" for s in one.seconds] or [f"{k} steps" for k in one.steps_ahead]
-        far = ", ".join(f"{error:.3g} at {at}" for error, at in zip(one.error, when))
-        coasting = ", ".join(f"{error:.3g}" for error in one.coasting)
+        far = ", ".join(f"{error:.3g} at {at}" for error, at in [*zip(one.error, when)][-2:])
+        coasting = ", ".join(f"{error:.3g}" for error in one.coasting[-2:])
         beaten = "" if one.beats_coasting else ", which predicts it better"
         yield f"  {one.name}: predicted to {far} (constant velocity: {coasting}{beaten})"
 

@@ -70,9 +70,7 @@ class Judging:
     windows: int = 3000  # held-out ones that are predicted, and entries into danger that margins are read from
     ahead: int = 8  # steps that features are predicted over
     read: int = 1000  # windows in which what a barrier reads is predicted
-    read_seconds: tuple[float, ...] = (1.0, 2.0)  # ahead, where the logs say how long a step is
-    read_steps: tuple[int, ...] = (1, 3, 8)  # ahead, where they do not, or where episodes or predictions end sooner
-    read_farthest: int = 40  # steps
+    read_steps: tuple[int, ...] = (1, 3, 5, 10, 15)  # ahead: rows are what guards look at, however long they take
     widened: tuple[int, ...] = (5, 7, 10, 15, 20, 30)  # steps ahead whose own margins are read
     foreseen: int = 1000  # entries that these are read from
     probed: int = 500  # states in which a barrier is asked about somebody nearer and farther
@@ -233,12 +231,9 @@ def _windows(logged: Logged, judging: Judging) -> tuple[tuple[int, ...], np.ndar
     """(how many steps ahead, held-out steps that as many follow and one precedes)."""
     row, first, last = (logged.picked(name, logged.held_steps) for name in ("row", "first_row", "last_row"))
     left = np.where(row > first, last - row, 0)
-    dt = logged.store.card.dt
-    in_seconds = () if dt is None else sorted({max(1, round(seconds / dt)) for seconds in judging.read_seconds})
-    for wanted in (in_seconds, judging.read_steps):
-        steps = tuple(k for k in wanted if k <= judging.read_farthest and (left >= k).sum() >= ENOUGH)
-        if steps:
-            return steps, logged.held_steps[left >= steps[-1]]
+    steps = tuple(k for k in judging.read_steps if (left >= k).sum() >= ENOUGH)
+    if steps:
+        return steps, logged.held_steps[left >= steps[-1]]
     return (), logged.held_steps[:0]
 
 

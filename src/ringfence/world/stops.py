@@ -26,6 +26,7 @@ BESIDE = 4  # values next to it
 SURELY = 3.0  # times what that law errs by
 ROUNDING = 4e-6  # of the value
 STEPS = 20_000  # that the law is of
+NONE = 1e9  # of a speed, no limit
 
 
 class Stop(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -83,13 +84,13 @@ class Bounds(NamedTuple):
 
     low: np.ndarray  # (N, D) float32, infinite where nothing stops
     high: np.ndarray
-    fastest: np.ndarray  # (N,)
+    fastest: np.ndarray  # (N,) NONE where nothing limits it
 
     @classmethod
     def of(cls, stops: Sequence[Stop], map: FeatureMap, agents: int) -> Bounds:
         at = Entries.of(map.names).at
         high = np.full((agents, len(at)), np.inf, np.float32)
-        low, fastest = -high, high[:, 0].copy()
+        low, fastest = -high, np.full(agents, NONE, np.float32)
         for stop in stops:
             who = slice(None) if stop.agent is None else stop.agent
             if stop.name == SPEED:
@@ -109,7 +110,7 @@ def held(stops: Sequence[Stop], map: FeatureMap, before: Array, after: Array) ->
     low, high, fastest = Bounds.of(stops, map, x.shape[-2])
     if np.isfinite(low).any() or np.isfinite(high).any():
         x = jnp.clip(x, jnp.minimum(low, before), jnp.maximum(high, before))
-    if np.isfinite(fastest).any():
+    if (fastest < NONE).any():
         own = np.array(velocity_of(map.names))
         most = jnp.maximum(fastest, _length(before[..., own]))
         share = most / jnp.maximum(_length(x[..., own]), most)
@@ -214,16 +215,18 @@ def _all(x: np.ndarray) -> np.ndarray:
 def _stops(
     names: Sequence[str], free: list[int], who: int | None, before: np.ndarray, after: np.ndarray, actions: np.ndarray
 ) -> Iterator[Stop]:
-    own, fastest = velocity_of(names), None
+    ends = {d: _ends(lambda x: x[:, 0], before[:, [d]], after[:, [d]], before, actions) for d in free}
+    own = velocity_of(names)
     if own and set(own) <= set(free):
         _, fastest = _ends(lambda x: np.sqrt((x**2).sum(-1)), before[:, own], after[:, own], before, actions)
-        if fastest is not None:
+        # who is fastest along each axis is fastest, and who is fastest is so along some axis, too
+        if fastest is not None and not _same(fastest, math.hypot(*(ends[d][1] or 0.0 for d in own))):
             yield Stop(SPEED, None, fastest, who)
-    for d in free:
-        low, high = _ends(lambda x: x[:, 0], before[:, [d]], after[:, [d]], before, actions)
-        if d in own:  # who is fastest along an axis is fastest
-            low = None if low is not None and _same(-low, fastest) else low
-            high = None if _same(high, fastest) else high
+            for d in own:
+                low, high = ends[d]
+                low = None if low is not None and _same(-low, fastest) else low
+                ends[d] = low, None if _same(high, fastest) else high
+    for d, (low, high) in ends.items():
         if low is not None or high is not None:
             yield Stop(names[d], low, high, who)
 

@@ -30,6 +30,7 @@ FOR_ONCE = 30  # rows of a look that is farther than that
 # Error of predictions as a share of what changes, or of what is read, up to which more rows count. Where causes read
 # what is predicted worse, of rays by 53 % and 87 %, guards left 33 to 52 % of episodes.
 BEARABLE = 0.3
+USUALLY = 10  # rows, at which that is asked
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
 FORMULA = "give a formula of danger (hazard)"
 
@@ -158,10 +159,11 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
     remedy = "log more episodes, or more of what decides how agents move"
     told = any(causes.causes for causes in card.causes.values())
     for one in error.read:
-        share = one.error[0] / max(one.deviation, 1e-9)
+        at = max((k for k, steps in enumerate(one.steps_ahead) if steps <= USUALLY), default=0)
+        share = one.error[at] / max(one.deviation, 1e-9)
         if told and share > BEARABLE:
-            when = f"{one.seconds[0]:g} s" if one.seconds else f"{one.steps_ahead[0]} steps"
-            found = f"{one.name} is predicted to {one.error[0]:.3g} at {when}, {share:.0%} of its deviation"
+            when = f"{one.seconds[at]:g} s" if one.seconds else f"{one.steps_ahead[at]} steps"
+            found = f"{one.name} is predicted to {one.error[at]:.3g} at {when}, {share:.0%} of its deviation"
             yield "unfit" if share > NOTHING else "weak", found, remedy
         if not one.beats_coasting:
             when = f"{one.seconds[-1]:g} s" if one.seconds else f"{one.steps_ahead[-1]} steps"
