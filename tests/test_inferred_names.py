@@ -275,3 +275,28 @@ def test_the_card_says_which_given_names_are_read_otherwise():
     assert "Logs tell what these entries are, which nobody named: own.vx (obs3)." in lines
     assert any(line.endswith("than given: own.x (s).") for line in lines)
     assert "Entries are read less one's own, too: other0.dv (truck0_speed less speed)." in lines
+
+
+@pytest.mark.parametrize("agents", [1, 3])
+def test_who_sees_nobody_is_known_by_what_its_places_change_by(agents):
+    """One robot, or several that do not see each other; whatever their entries are called."""
+    rng = np.random.default_rng(0)
+    place, goal, post = (rng.normal(0, size, (30, agents, 2)) for size in (2, 3, 3))
+    velocity, walk = np.zeros_like(place), rng.normal(0, 0.3, place.shape)
+    rows = []
+    for _ in range(60):
+        rows.append(np.concatenate([place, velocity, goal - place, post - place, walk - velocity], -1))
+        push = np.clip(0.5 * (goal - place) - velocity + rng.normal(0, 0.3, place.shape), -1, 1)
+        velocity = velocity + 0.1 * push
+        place, post = place + 0.1 * velocity, post + 0.1 * walk
+    x = np.stack(rows, 1).reshape(-1, agents, 10).astype(np.float32)
+    first = np.arange(30) * 60
+    own = ("own.x", "own.y", "own.vx", "own.vy")
+    assert inferred_names(x[..., :4], ["along", "aside", "v_along", "v_aside"], first) == own
+    assert inferred_names(x[..., [0, 2]], ["s", "speed"], first) == ("own.x", "own.vx")
+    things = ("still_a.dx", "still_a.dy", "thing_a.dx", "thing_a.dy", "thing_a.dvx", "thing_a.dvy")
+    assert inferred_names(x, [f"obs{k}" for k in range(10)], first) == own + things
+    unknown = ("a", "b", "c", "d")
+    assert inferred_names(x[..., 6:], ["a_dx", "a_dy", "a_dvx", "a_dvy"], first)[:2] == ("a_dx", "a_dy"), "so called"
+    assert inferred_names(x[..., [0, 1, 4, 5]], unknown, first) == unknown, "no velocity"
+    assert inferred_names(rng.normal(size=x.shape)[..., :4], unknown, first) == unknown

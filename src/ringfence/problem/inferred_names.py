@@ -3,8 +3,8 @@
 What an agent sees of another is, number for number, that other's own entry less its own; and what two see of each other
 is the same with the opposite sign. Nothing else in logs is so exact, so such entries may be named as if somebody had:
 `other0.dx` of agent 0 is minus `other0.dx` of agent 1. Their velocities, one's own place, what stands still, what else
-moves and where a body heads for follow. Names that were given and may mean something (`truck0_dx`) decide what numbers
-leave open: which of several such entries are places.
+moves and where a body heads for follow. Who sees nobody has a place that changes as a velocity says. Names that were
+given and may mean something (`truck0_dx`) decide what numbers leave open: which of several such entries are places.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
+ALIKE = 0.9  # correlation of a change with a velocity, below which it is none
 LESS = 0.5  # of a change that is left of that of a velocity relative to one's own, once one's own is added
 CALLED = 0.5  # of a change: what names call a velocity is off by less
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
@@ -50,13 +51,14 @@ def inferred_names(
     Those that do not follow stay as they are, and so do those to `keep`. `first_rows` (E,) are those that episodes
     begin with."""
     said = Entries.of(names)
-    if observations.shape[1] < 2 or said.own or said.others:
+    if said.own or said.others:
         return tuple(names)
     steps = Steps.of(observations, first_rows)
     if steps is None:
         return tuple(names)
-    fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)]) or _listed(steps)
-    moving = _along_axes(steps, fields, names)
+    several = observations.shape[1] > 1
+    fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)]) or _listed(steps) if several else []
+    moving = _along_axes(steps, fields or _by_oneself(steps, names), names)
     if moving is None:
         return tuple(names)
     found: dict[int, str] = {}
@@ -180,6 +182,31 @@ def _with_speeds(steps: Steps, fields: list[_Field], where: np.ndarray | None = 
     return fields
 
 
+def _by_oneself(steps: Steps, names: Sequence[str]) -> list[_Field]:
+    """Of who sees nobody: one's own places, which change as their velocities say. None where there are too many."""
+    free = [e for e in range(len(steps.deviation)) if steps.varies(e)]
+    change = _centred(steps.change(free))
+    rates = [_centred(rows[..., free]) for rows in (steps.after, steps.before)]
+    alike = np.maximum(*(change.T @ rate for rate in rates)) > ALIKE
+    pairs = {}
+    for p, place in enumerate(free):
+        off = {v: unlike(steps, [place], [v]) for v in (free[k] for k in np.flatnonzero(alike[p])) if v != place}
+        best = min(off, key=off.__getitem__, default=place)
+        if best != place and off[best] <= LIKE and loosely(names[place])[0] in (None, "place"):
+            pairs[place] = best
+    pairs = {place: v for place, v in pairs.items() if place not in pairs.values()}  # of velocities, accelerations
+    if any(one != two and _is_relative(steps, one, two) for one in pairs.values() for two in pairs.values()):
+        pairs = {place: v for place, v in pairs.items() if _opposite(steps, place, free)}
+    return [_Field((), place, _Field((), v)) for place, v in pairs.items()] if len(pairs) <= len(SPACE) else []
+
+
+def _centred(x: np.ndarray) -> np.ndarray:
+    """(W N, k) of numbers (W, N, k), whose products are correlations."""
+    flat = x.reshape(-1, x.shape[-1])
+    flat = flat - flat.mean(0)
+    return flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-30)
+
+
 def _along_axes(steps: Steps, fields: Sequence[_Field], names: Sequence[str]) -> dict[str, _Field] | None:
     """The fields that are places, by axis: those that names call so; of those that they call nothing, what changes as
     another one says, or all. None where there are too many."""
@@ -206,7 +233,7 @@ def _along_axes(steps: Steps, fields: Sequence[_Field], names: Sequence[str]) ->
 
 def _called(found: _Field, names: Sequence[str]) -> tuple[Role | None, str]:
     """What names call it, where they agree."""
-    said = {loosely(names[entry]) for entry in found.entries}
+    said = {loosely(names[entry]) for entry in found.entries or [found.own] if entry is not None}
     if len(said) > 1:
         return None, ""
     role, axis = said.pop()
@@ -287,12 +314,17 @@ def _still(steps: Steps, places: Mapping[str, _Field], named: set[int]) -> Itera
     for place in places.values():
         if place.own is None:
             return
-        moved = steps.change([place.own])[..., 0].ravel()
         free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
-        found.append([e for e in free if steps.equal(steps.change([e])[..., 0].ravel(), -moved, place.own)])
+        found.append(_opposite(steps, place.own, free))
     for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*found)):
         for axis, entry in zip(places, entries):
             yield entry, f"still_{letter}.d{axis}"
+
+
+def _opposite(steps: Steps, place: int, entries: Sequence[int]) -> list[int]:
+    """Those of the entries that change as a place does, with the opposite sign."""
+    moved = steps.change([place])[..., 0].ravel()
+    return [e for e in entries if steps.equal(steps.change([e])[..., 0].ravel(), -moved, place)]
 
 
 def _heading(steps: Steps, found: Mapping[int, str], called: Sequence[int]) -> dict[int, str]:

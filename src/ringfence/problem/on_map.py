@@ -134,7 +134,7 @@ def relative(
     if listed:
         columns = replace(columns, names=tuple(re.sub(r"^other(\d+\.)", r"listed\1", name) for name in columns.names))
     if joined is not None and len(columns.plus) > 1 and (listed or not Entries.of(found).others):
-        seen = free if joined[1] is not None else list(_own_axes(steps, free, found).values())
+        seen = free if joined[1] is not None else list(_own_axes(steps, free, found if listed else names).values())
         columns = columns.with_others(_of_state(steps, seen, names, joined, keep))
         found = called(columns)
     own = _own_axes(steps, free, found)

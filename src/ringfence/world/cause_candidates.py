@@ -130,7 +130,8 @@ def beside(cause: Cause, names: Sequence[str], multiplied: bool = False) -> Iter
             found += _closing(kind, each, axes, own) if axes else ()
     yield from found
     if multiplied:
-        yield from map(squared, found)
+        read = {one for each in cause.reads for one in leaves(each)}
+        yield from (squared(one) for one in found if one not in read)
         yield from _products(own)
 
 
