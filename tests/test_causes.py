@@ -807,11 +807,11 @@ def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
     assert verdict.judge(card((0.1, 0.2), (0.2, 0.3))).word == "fit"
     assert verdict.judge(card((0.0, 0.019), (0.0, 0.0))).word == "fit", "so little is no error"
     assert "at 25 steps" in str(card((0.1, 0.2), (0.2, 0.3), ()))
-    rays = card((0.7, 1.2), (0.8, 1.4))
+    rays = card((0.9, 1.2), (1.0, 1.4))
     assert verdict.judge(rays).word == "fit", "of networks on all entries that is no single number"
     told = msgspec.structs.replace(rays, causes={"": Found((Cause((Entry((0,), "ray"),)),), 1.0)})
     assert verdict.judge(told).reasons == (
-        "length of other.dx, other.dy, of the nearest is predicted to 0.7 at 0.96 s, 35% of its deviation",
+        "length of other.dx, other.dy, of the nearest is predicted to 0.9 at 0.96 s, 45% of its deviation",
     )
     assert verdict.judge(told).word == "weak"
     worse = msgspec.structs.replace(card((2.2, 2.4), (2.3, 2.5)), causes=told.causes)
