@@ -53,8 +53,8 @@ def main() -> None:
             if kind.name in (given.systems or [kind.name]):
                 rows_of(kind, file, whole, seed if given.seed is None else given.seed)
     found = of_json("proving/trackers.json")
-    if TRACKED.name in (given.systems or [TRACKED.name]) and "as it is" not in found:
-        keep(RESULTS / "proving" / "trackers.json", {"as it is": tracked()} | found)
+    if TRACKED.name in (given.systems or [TRACKED.name]) and "today" not in found:
+        keep(RESULTS / "proving" / "trackers.json", found | {"today": tracked()})
 
 
 def played(kind: Kind, world: Any, clone: Any, driver: str, guard: str, episodes: int = EPISODES) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def _collected() -> dict[str, tuple[list[str], Shares]]:
     found["danger of other shapes"] = _table("shapes.csv", (MORE, RULES))
     found["nine families"] = _table("families.csv", (RULES,))
     found["places on a map"] = _table("on_map.csv", ("how far away",))
-    lists = of_json("proving/trackers.json")["as it is"]
+    lists = of_json("proving/trackers.json")["today"]
     rows = {"clone": "clone", "clone, shield": "clone, shield", "naive": "naive", "naive, shield": "naive, shield"}
     shares = {k if "," in k else f"{k}, none": [lists[v]["violation_rate"]] for k, v in rows.items()}
     found["a list of the two nearest"] = [lists["verdict"]], shares

@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import jax
+import msgspec
 import numpy as np
 import pytest
 
@@ -25,6 +26,7 @@ from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
+from ringfence.world.stops import SPEED, Stop
 from tests.quick import QUICK_WORLD
 
 SHIELD = dict(guard="shield", horizon=1, correction_steps=3, margin=4.0)
@@ -119,10 +121,15 @@ def test_cloning(run, small_store, tmp_path):
 
 
 def test_a_shield(run, small_store, small_world, tmp_path, capsys):
-    """Its rounds of correction are a loop that ends when nothing is missing. The file remembers what it did last."""
+    """Its rounds of correction are a loop that ends when nothing is missing. The file remembers what it did last, and
+    knows where speeds end."""
     pytest.importorskip("jax2onnx")
     from ringfence import world as worlds_files
 
+    ends = (Stop("own.vx", -0.3, 0.2), Stop(SPEED, None, 0.4))
+    card = msgspec.structs.replace(small_world.card, data=msgspec.structs.replace(small_world.card.data, stops=ends))
+    acts = dataclasses.replace(small_world.dynamics, stops=ends)
+    small_world = dataclasses.replace(small_world, dynamics=acts, card=card)
     kept = worlds_files.save(small_world, tmp_path / "w.safetensors")
     words = [
         "--guard",
