@@ -41,6 +41,7 @@ from ringfence.world.model import World, blank_world
 FORMAT = 21  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.9  # recall of causes, below which networks on all entries are tried, too
+READ = 500_000  # steps, at most, that ends are looked for in
 STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
@@ -202,6 +203,8 @@ def _data(store: EpisodeStore, logged: Logged, thrown: int, acts: dynamics.Dynam
 
 
 def _stops(logged: Logged, steps: np.ndarray, predicted: np.ndarray) -> tuple[stops.Stop, ...]:
+    if len(steps) > READ:
+        steps = np.sort(np.random.default_rng(0).choice(steps, READ, replace=False))
     safe = ~logged.unsafe[steps] if logged.labels else np.ones(len(steps), bool)
     moves = logged.before(steps), logged.after(steps), logged.picked("actions", steps)
     return stops.found(logged.map, predicted, moves, safe, logged.store.card.homogeneous)
