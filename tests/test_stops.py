@@ -5,11 +5,13 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 
 from ringfence import EpisodeStore
 from ringfence.deploy import zoo
+from ringfence.errors import UserError
 from ringfence.guards.proof import Box, Prover, motion_of
 from ringfence.loading.resolve import load as load_run
 from ringfence.problem.features import FeatureMap
@@ -102,13 +104,13 @@ def test_nobody_goes_beyond_a_stop():
     before = jnp.zeros((3, N, 5)).at[2, :, 1].set(3.0)
     after = before + jnp.array([2.0, 3.0, 4.0, -3.0, -4.0])
     known = (Stop("own.x", -1.0, 1.0, 0), Stop(SPEED, None, 2.5))
-    x = np.asarray(stops.held(known, map, before, after))
+    x = np.asarray(stops.saturated(known, map, before, after))
     np.testing.assert_allclose(x[0], [[1, 1.5, 2, -1.5, -2], [2, 1.5, 2, -1.5, -2]], rtol=1e-5)
     assert np.allclose(np.linalg.norm(x[2, :, 1:3], axis=-1), 3.0, rtol=1e-5), "no faster than it was"
-    assert stops.held((), map, before, after) is after
-    one = np.asarray(stops.held((Stop(SPEED, None, 2.5, 1),), map, before, after))
+    assert stops.saturated((), map, before, after) is after
+    one = np.asarray(stops.saturated((Stop(SPEED, None, 2.5, 1),), map, before, after))
     assert np.array_equal(one[0, 0], after[0, 0]) and np.allclose(one[0, 1, 1:3], [1.5, 2.0]), "nothing stops the first"
-    slope = jax.grad(lambda x: stops.held(known, map, before, x).sum())(jnp.zeros_like(after))
+    slope = jax.grad(lambda x: stops.saturated(known, map, before, x).sum())(jnp.zeros_like(after))
     assert np.isfinite(slope).all(), "at rest, too"
 
 
@@ -144,7 +146,7 @@ def test_who_never_went_backwards_is_not_predicted_to():
     np.testing.assert_allclose(Heading((0,), (1, 2)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
     names = ("own.v", "own.cos", "own.sin", "thing_a.dvy", "own.dvx", "other1.dvx", "other1.dx")
     asked = jnp.array([[-1.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0]])
-    moved = stops.held((Stop(AHEAD, 0.0),), view(names, 1), asked, asked)
+    moved = stops.saturated((Stop(AHEAD, 0.0),), view(names, 1), asked, asked)
     np.testing.assert_allclose(moved, [[0, 0.6, 0.8, -0.8, 0, -0.6, 0]], atol=1e-6)
 
 
@@ -169,6 +171,15 @@ def test_a_car_that_brakes_at_rest_stays(tmp_path):
     assert free.step(rest, brake)[0][0, 0, 0] < -0.02 and made.dynamics.step(rest, brake)[0][0, 0, 0] > -1e-5
     again = load(save(made, tmp_path / "w.safetensors"))
     assert again.dynamics.stops == made.dynamics.stops == again.card.data.stops
+
+
+@pytest.mark.parametrize("wrong", [Stop("own.v", 0.0, 1.0), Stop(SPEED, None, 1.0, 9), Stop(SPEED, 1.0), Stop(AHEAD)])
+def test_a_file_with_stops_of_somebody_else_is_refused(wrong, small_world, tmp_path):
+    data = msgspec.structs.replace(small_world.card.data, stops=(wrong,))
+    card = msgspec.structs.replace(small_world.card, data=data)
+    file = save(dataclasses.replace(small_world, card=card), tmp_path / "w.safetensors")
+    with pytest.raises(UserError, match="has stops of agents or entries that it does not know; fit it again"):
+        load(file)
 
 
 def test_a_proof_holds_at_a_stop(tmp_path):

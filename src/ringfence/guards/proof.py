@@ -24,7 +24,7 @@ from ringfence.world import World
 from ringfence.world.barrier import Barrier, soft
 from ringfence.world.cause_nets import CauseNet, Distance, Score
 from ringfence.world.dynamics import Dynamics
-from ringfence.world.stops import NONE, Bounds, Heading
+from ringfence.world.stops import UNLIMITED, Heading, Saturation
 
 EXACT = ("seen",)  # entries that are no measurements, by the ends of their names
 ROUNDING = 1e-5  # share of what is summed that single precision may lose
@@ -214,12 +214,12 @@ class Prover(eqx.Module):
         """The change of an own velocity, which was within `begun`, as stops leave it."""
         dynamics = self.world.dynamics
         own = motion_of(dynamics.map).own
-        low, high, fastest = Bounds.of(dynamics.stops, dynamics.map, 1)  # of homogeneous agents
+        low, high, fastest = Saturation.of(dynamics.stops, dynamics.map, 1)  # of homogeneous agents
         low, high = low[0, own], high[0, own]
         if np.isfinite(low).any() or np.isfinite(high).any():
             least, most = _ends_of(begun, change)
             change = _widened(change, jnp.minimum(high - most, 0.0), jnp.maximum(low - least, 0.0))
-        if fastest[0] < NONE:
+        if fastest[0] < UNLIMITED:
             least, most = _ends_of(begun, change)
             size = jnp.sqrt((jnp.maximum(-least, most) ** 2).sum(-1, keepdims=True))
             slower = 1.0 - fastest[0] / jnp.maximum(size, fastest[0])  # the share that is lost, at most

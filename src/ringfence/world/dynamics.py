@@ -125,7 +125,7 @@ class Dynamics(eqx.Module):
         """Features (..., N or 1, D) whose predicted entries change so, as far as nothing stops them."""
         before = before[..., :1, :] if self.map.joint else before
         moved = change * self.step_scale + self.step_mean
-        return stops.held(self.stops, self.map, before, before.at[..., self.predicted].add(moved))
+        return stops.saturated(self.stops, self.map, before, before.at[..., self.predicted].add(moved))
 
     def stopped(self, before: Array, change: Array) -> Array:
         """The standardised change (..., N or 1, F) that is left of one. What goes beyond a stop is no error: networks

@@ -41,7 +41,7 @@ from ringfence.world.model import World, blank_world
 FORMAT = 21  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.9  # recall of causes, below which networks on all entries are tried, too
-READ = 500_000  # steps, at most, that ends are looked for in
+READ = 500_000  # steps, at most, that stops are looked for in
 STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
@@ -154,9 +154,9 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
     if thrown:
         steps = steps[~logged.unsafe[steps]]
         moved.append(_digest(logged.unsafe))
-    ends = _stops(logged, steps, blank.dynamics.predicted)
-    moved.append(ends)
-    acts = _dynamics(logged, steps, moved, dataclasses.replace(blank.dynamics, stops=ends), of)
+    known = _stops(logged, steps, blank.dynamics.predicted)
+    moved.append(known)
+    acts = _dynamics(logged, steps, moved, dataclasses.replace(blank.dynamics, stops=known), of)
     if map.mirrored:
         acts = _with_partners(acts, logged, steps, moved, of)
         moved.append(acts.map.mirrored)

@@ -1,4 +1,4 @@
-"""Where bodies stop: what logs come to again and again, to the digit, and never pass.
+"""Stops: saturation limits, which logs come to again and again, to the digit, and never pass.
 
 Speeds and steering have ends, batteries are full, rooms have walls. Networks that saw few steps there predict that who
 pushes on goes on, so that a guard plans what nobody can do.
@@ -26,7 +26,7 @@ BESIDE = 4  # values next to it
 SURELY = 3.0  # times what that law errs by
 ROUNDING = 4e-6  # of the value
 STEPS = 20_000  # that the law is of
-NONE = 1e9  # of a speed, no limit
+UNLIMITED = 1e9  # a speed
 
 
 class Stop(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -42,6 +42,12 @@ class Stop(msgspec.Struct, frozen=True, omit_defaults=True):
         whose = "" if self.agent is None else f" of agent {self.agent}"
         ends = [f"{end:.3g}" for end in (self.low, self.high) if end is not None]
         return f"{self.name}{whose} at {' and '.join(ends)}"
+
+    def fits(self, map: FeatureMap) -> bool:
+        """Whether it is of an agent and of a value that the view has."""
+        known = self.agent is None or 0 <= self.agent < len(map.plus)
+        needed = {SPEED: self.high, AHEAD: self.low}
+        return known and (needed[self.name] is not None if self.name in needed else self.name in map.names)
 
 
 @dataclass(frozen=True)
@@ -79,18 +85,18 @@ class Heading:
         return x.at[..., np.array(self.velocity)].add(lacks * _ahead(x, self.direction))
 
 
-class Bounds(NamedTuple):
-    """Of agents, who are N, or 1 where all are alike."""
+class Saturation(NamedTuple):
+    """The stops of agents, who are N, or 1 where all are alike, as arrays."""
 
     low: np.ndarray  # (N, D) float32, infinite where nothing stops
     high: np.ndarray
-    fastest: np.ndarray  # (N,) NONE where nothing limits it
+    fastest: np.ndarray  # (N,) UNLIMITED where nothing stops it
 
     @classmethod
-    def of(cls, stops: Sequence[Stop], map: FeatureMap, agents: int) -> Bounds:
+    def of(cls, stops: Sequence[Stop], map: FeatureMap, agents: int) -> Saturation:
         at = Entries.of(map.names).at
         high = np.full((agents, len(at)), np.inf, np.float32)
-        low, fastest = -high, np.full(agents, NONE, np.float32)
+        low, fastest = -high, np.full(agents, UNLIMITED, np.float32)
         for stop in stops:
             who = slice(None) if stop.agent is None else stop.agent
             if stop.name == SPEED:
@@ -101,16 +107,16 @@ class Bounds(NamedTuple):
         return cls(low, high, fastest)
 
 
-def held(stops: Sequence[Stop], map: FeatureMap, before: Array, after: Array) -> Array:
+def saturated(stops: Sequence[Stop], map: FeatureMap, before: Array, after: Array) -> Array:
     """Features (..., N or 1, D) after a step, which are no farther beyond a stop than they were `before` it. What is
     relative to the own velocity goes with it."""
     if not stops:
         return after
     x = after
-    low, high, fastest = Bounds.of(stops, map, x.shape[-2])
+    low, high, fastest = Saturation.of(stops, map, x.shape[-2])
     if np.isfinite(low).any() or np.isfinite(high).any():
         x = jnp.clip(x, jnp.minimum(low, before), jnp.maximum(high, before))
-    if (fastest < NONE).any():
+    if (fastest < UNLIMITED).any():
         own = np.array(velocity_of(map.names))
         most = jnp.maximum(fastest, _length(before[..., own]))
         share = most / jnp.maximum(_length(x[..., own]), most)
@@ -125,8 +131,7 @@ def held(stops: Sequence[Stop], map: FeatureMap, before: Array, after: Array) ->
 def _with_relative(names: Sequence[str], asked: Array, x: Array) -> Array:
     """Features (..., D) whose velocities less one's own follow from the own velocity, which was that of `asked`."""
     known = Entries.of(names)
-    own = {axis: known.own[f"v{axis}"] for axis in known.axes if f"v{axis}" in known.own}
-    if own:
+    if own := _velocity(known):
         less = {axis: x[..., d] - asked[..., d] for axis, d in own.items()}
     elif known.speed is not None and len(known.direction) == 2:
         less = dict(zip(known.axes, jnp.moveaxis(_of_speed(known, x) - _of_speed(known, asked), -1, 0)))
@@ -155,9 +160,13 @@ def _length(x: Array) -> Array:
 
 def velocity_of(names: Sequence[str]) -> list[int]:
     """Own entries of a velocity along two axes or more; none where names tell of none."""
-    known = Entries.of(names)
-    own = [known.own[f"v{axis}"] for axis in known.axes if f"v{axis}" in known.own]
-    return own if len(own) > 1 else []
+    own = _velocity(Entries.of(names))
+    return [*own.values()] if len(own) > 1 else []
+
+
+def _velocity(known: Entries) -> dict[str, int]:
+    """Own entries of the velocity, by axis."""
+    return {axis: known.own[f"v{axis}"] for axis in known.axes if f"v{axis}" in known.own}
 
 
 # --- what logs say ---
