@@ -121,8 +121,8 @@ def test_cloning(run, small_store, tmp_path):
 
 
 def test_a_shield(run, small_store, small_world, tmp_path, capsys):
-    """Its rounds of correction are a loop that ends when nothing is missing. The file remembers what it did last, and
-    knows where speeds end."""
+    """Its rounds of correction are a loop that ends when nothing is missing, around one along the predicted rows. The
+    file remembers what it did last, and knows where speeds end."""
     pytest.importorskip("jax2onnx")
     from ringfence import world as worlds_files
 
@@ -135,7 +135,7 @@ def test_a_shield(run, small_store, small_world, tmp_path, capsys):
         "--guard",
         "shield",
         "--horizon",
-        "1",
+        "2",
         "--margin",
         "4",
         "--set",
@@ -149,7 +149,7 @@ def test_a_shield(run, small_store, small_world, tmp_path, capsys):
     assert [x["name"] for x in told["inputs"]] == ["observations", "state", "memory.action"]
     assert told["initial"] == {"memory.action": 0.0}
     assert told["variant"].startswith("default+shield-learned") and told["guard_options"]["margin"] == 4.0
-    steps = played(run, small_store, world=small_world, **SHIELD)
+    steps = played(run, small_store, world=small_world, **SHIELD | {"horizon": 2})
     assert apart(call, told, steps) <= 2e-5  # corrections add up what rounding does (docs/export.md)
     assert any(expected["info.infeasible"] for _, expected in steps), "there was something to correct"
 

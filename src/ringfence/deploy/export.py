@@ -256,7 +256,7 @@ def _flat(initial: dict[str, np.ndarray]) -> dict[str, str]:
 
 def as_onnx(step: Step) -> Any:
     """The function as an ONNX model of the opset OPSET; what jax2onnx has no words for is refused."""
-    convert, checked = _converter()
+    convert, checked, runtime = _converter()
     log = logging.getLogger("onnx_ir")  # which says of values inside loops that it knows no type for them
     level = log.level
     log.setLevel(logging.ERROR)
@@ -276,6 +276,12 @@ def as_onnx(step: Step) -> Any:
         log.setLevel(level)
     _swept(model.graph)
     checked(model)
+    try:  # what is well formed may still be what no runtime loads
+        session = runtime(model.SerializeToString(), providers=["CPUExecutionProvider"])
+        session.run(None, {x.name: np.zeros(x.shape, x.dtype) for x in step.inputs})
+    except Exception as error:
+        what = str(error).splitlines()[0]
+        raise UserError(f"The ONNX file of this policy would not run ({what}); write it as StableHLO.") from error
     return model
 
 
@@ -300,14 +306,15 @@ def _packer() -> Any:
     return jax_export
 
 
-def _converter() -> tuple[Callable, Callable]:
-    """What converts to ONNX, and what checks the result."""
+def _converter() -> tuple[Callable, Callable, Callable]:
+    """What converts to ONNX, what checks the result, and what runs it."""
     as_it_was = jnp.cumsum  # which jax2onnx replaces for good, by one that takes no axis by its place
     with needs("export", "ONNX files"):
         from jax2onnx import to_onnx
         from onnx.checker import check_model
+        from onnxruntime import InferenceSession
     jnp.cumsum = as_it_was
-    return to_onnx, check_model
+    return to_onnx, check_model, InferenceSession
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,9 @@ class Dynamics(eqx.Module):
         """Features (..., N, D) after actions (..., N, A) in [−1, 1], the mean over members, and how far these are
         apart (..., N): the root mean square over entries of their deviation, in units of a usual step."""
         change = self.changes(before, action)
-        spread = jnp.sqrt((self.stopped(before, change).var(0)).mean(-1) + 1e-12)
+        # One by one: of a state that is repeated for every member within a loop jax2onnx makes wrong files.
+        stopped = jnp.stack([self.stopped(before, of_member) for of_member in change])
+        spread = jnp.sqrt(stopped.var(0).mean(-1) + 1e-12)
         after = self.arrived(before, change.mean(0))
         return after, jnp.broadcast_to(spread, after.shape[:-1])
 
