@@ -65,7 +65,6 @@ def less(found: Rows, others: Rows, task: str) -> str:
 WAYS = {
     "alone": "without guidance (`madiff`)",
     "as it is": "`icbf`, as it is",
-    "best of 8": "the best of 8",
     "best of 64": "the best of 64",
 }
 
@@ -78,8 +77,10 @@ def spread() -> str:
         if rows:
             logs = json.loads((RESULTS / "planner" / f"rows-{task}.json").read_text())["logs"]
             cells = [brief(played(rows, "icbf", way)) for way in WAYS]
+            cells.insert(2, brief(played(rows_of("values", task), "icbf", "value guidance")))
             lines.append((task.removeprefix("simple_spread-"), f"{logs:.2f}", *cells))
-    return markdown(("logs", "they earn", *WAYS.values()), lines)
+    alone, guided, *best = WAYS.values()
+    return markdown(("logs", "they earn", alone, guided, "values guide, too", *best), lines)
 
 
 LEARNED = ("simple_spread-expert", "simple_spread-expert-pooled")
@@ -133,6 +134,7 @@ def glance() -> str:
         "*the paper prints*",
         "Algorithm 1 as printed",
         "ICBF as it is",
+        "ICBF, values guide",
         "ICBF, shield",
         "ICBF, `full`",
         "BC, shield",
@@ -154,6 +156,7 @@ def glance() -> str:
             guarded = rows_of("guards", task)
             cells.append(brief([r for r in algorithm1 if r["name"] == best]))
             cells.append(brief(played(rows_of("rows", task), "icbf", "as it is")))
+            cells.append(brief(played(rows_of("values", task), "icbf", "value guidance")))
             cells += [brief(played(guarded, "icbf", f"under {guard}")) for guard in ("shield", "full")]
             clones = sums_of("guards", task, ("bc", "default+shield-learned"))
             cells.append(clones if clones != "–" else pooled_row(task, "bc, 20,000 updates, under shield"))
@@ -162,7 +165,9 @@ def glance() -> str:
         else:
             rows = rows_of("robots", task)
             cells.append(robot(played(rows_of("algorithm1", task), "λ = 1", "cool"), task))
-            cells += [robot(played(rows, "icbf", way), task) for way in ("cool", "cool, under adapt")] + ["–"]
+            of_values = robot(played(rows_of("values", task), "icbf", "cool, value guidance"), task)
+            plain, guarded = (robot(played(rows, "icbf", way), task) for way in ("cool", "cool, under adapt"))
+            cells += [plain, of_values, guarded, "–"]
             cells.append(sums_of("guards-mujoco", task, ("bc", "default+adapt-learned")))
             cells.append(sums_of("mujoco", task, ("behaviour data", "reference")))
         lines.append(cells)

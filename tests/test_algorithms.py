@@ -22,6 +22,7 @@ from ringfence.loading.resolve import load
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import draw
+from ringfence.proposals.guidance import AHEAD_ROWS, climbed, worth
 from ringfence.proposals.options import WIDE
 from ringfence.training import loop
 from ringfence.training.job import make_job
@@ -206,7 +207,7 @@ def test_gradient_depths(small_store, small_world, gradient):
         dict(),
         dict(num_samples=3, guard="select", barrier="both"),
         dict(replan=2, sampler="dpm++"),
-        dict(num_samples=2, select=True, value_guidance=5.0, cfg_scale=1.0, sampler="ddpm", correction_steps=2),
+        dict(num_samples=2, select=True, value_guidance=0.5, anyway=True, sampler="ddpm", correction_steps=2),
     ],
 )
 def test_planner_options(trained, options):
@@ -233,10 +234,34 @@ def test_several_plans_are_drawn_ever_farther_apart(trained, small_store):
     assert load(trained["icbf"])[1].options.spread == WIDE
 
 
+def test_values_steer_what_is_drawn(trained, small_store, small_world):
+    """Actions that climb are worth more by what the World foresees, and plans that are steered are others."""
+    policy = load(trained["icbf"], world=small_world, value_guidance=0.5, barrier_guidance=1.0, anyway=True)[1]
+    seen, state = jnp.asarray(small_store.observations[:8]), jnp.asarray(small_store.state[:8])
+    judged = policy.world.map(seen, state)
+    worth_of = lambda actions: worth(policy, judged, actions)  # noqa: E731
+    actions = jnp.zeros((8, AHEAD_ROWS, 3, 2))
+    assert worth_of(climbed(lambda x: x, worth_of, actions, 0.01, 3)) > worth_of(actions) + 0.01
+    first = [policy.act(policy.initial_state(8), seen, state, jax.random.key(0))[1].action]
+    unsteered = dataclasses.replace(policy, options=dataclasses.replace(policy.options, value_guidance=0.0))
+    first.append(unsteered.act(unsteered.initial_state(8), seen, state, jax.random.key(0))[1].action)
+    assert jnp.isfinite(first[0]).all() and jnp.abs(first[0] - first[1]).max() > 0.05
+
+
+def test_what_is_climbed_moves_actions_by_what_is_asked_and_stays_in_bounds():
+    x = jnp.array([[0.0, 0.3], [0.0, 0.0]])
+    double = lambda x: (2.0 * x).reshape(2, 1, 1, 2)  # noqa: E731
+    uphill = lambda a: (a * jnp.array([4.0, 3.0])).sum()  # noqa: E731
+    moved = double(climbed(double, uphill, x, 0.5, 1))[:, 0, 0]
+    np.testing.assert_allclose(moved[1], [0.4, 0.3], atol=1e-6)
+    assert (double(climbed(double, uphill, x, 0.5, 50)) <= 1.0 + 1e-6).all()
+    np.testing.assert_array_equal(climbed(double, lambda a: 0.0 * a.sum(), x, 0.5, 3), x)
+
+
 def test_a_controller_acts_like_the_policy(trained, small_store):
-    how = dict(planner="value_guided", guard="select", sampling_steps=2, num_samples=2, correction_steps=1)
+    how = dict(planner="value_guided", guard="select", sampling_steps=2, num_samples=2, correction_steps=1, anyway=True)
     pilot = Controller(trained["icbf"], **how)
-    assert pilot.policy.proposal.options.value_guidance == 100.0 and pilot.policy.guard.options.num_samples == 2
+    assert pilot.policy.proposal.options.value_guidance == 0.5 and pilot.policy.guard.options.num_samples == 2
     seen, state = small_store.observations[0], small_store.state[0]
     first = pilot.act(seen, state)
     assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["ood"].dtype == bool
@@ -277,9 +302,9 @@ def test_names_of_variants_follow_values(trained):
     run = Run(trained["icbf"].path)
     for options, name in (
         ({"guard": "select", "num_samples": 3}, "default+select-learned+num_samples3"),
-        ({"planner": "value_guided", "sampling_steps": 2}, "default+value_guided+sampling_steps2"),
+        ({"planner": "low_temperature", "sampling_steps": 2}, "default+low_temperature+sampling_steps2"),
         ({"margin": 0, "horizon": "2", "guard": "shield"}, "default+shield-learned+horizon2+margin0.0"),
-        ({"value_guidance": "1e1"}, "default+value_guidance10.0"),
+        ({"temperature": "1e1"}, "default+temperature10.0"),
         ({"guard": "adapt", "barrier": "analytic", "adapt": 0.2}, "default+adapt-analytic+adapt0.2"),
     ):
         assert resolve.resolve(PolicySpec.of(run, **options)).variant("test") == name

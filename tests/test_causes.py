@@ -762,7 +762,7 @@ def test_values_that_are_worse_than_none_are_not_climbed(small_world):
     misled = dataclasses.replace(small_world, card=card)
     assert "returns-to-go are predicted worse than by their mean: guards that climb them" in str(card)
     still = lambda observations, state: np.zeros((3, 2))  # noqa: E731
-    with pytest.raises(UserError, match="returns-to-go worse than by their mean, and this guard climbs them"):
+    with pytest.raises(UserError, match="returns-to-go worse than by their mean, and these options climb them"):
         guard(still, misled, guard="full")
     assert guard(still, misled, guard="full", anyway=True) and guard(still, misled, guard="shield")
 

@@ -147,7 +147,7 @@ def test_a_guard_gets_as_many_proposals_as_it_asks_for(run, two_drivers, count):
     [
         ({"replan": 2}, "replan=2 is about plans of states"),
         ({"sampler": "ddpm"}, "sampler=ddpm is about plans of states"),
-        ({"planner": "value_guided"}, "value_guidance=100.0 is about plans of states"),
+        ({"planner": "value_guided"}, "value_guidance=0.5 is about plans of states"),
     ],
 )
 def test_options_of_plans_of_states_are_refused(run, options, said):

@@ -75,15 +75,6 @@ def test_entries_are_read_by_their_weight():
     assert weights["own.vx"] == weights["other1.dvy"] == 0.25 and weights["own.x"] == weights["landmark0.dx"] == 1.0
 
 
-def test_plan_value_sums_rewards_and_the_last_value():
-    critic = values.blank_critic(4)
-    rows = jax.random.normal(jax.random.key(0), (2, 3, 2, 4))
-    r, g = values.state_values(critic, rows)
-    expected = r[:, 0] + 0.5 * r[:, 1] + 0.25 * r[:, 2] + 0.125 * g[:, 2]
-    np.testing.assert_allclose(values.plan_value(critic, rows, 0.5), expected, rtol=1e-5)
-    assert jnp.isfinite(expected).all()
-
-
 def test_what_ended_for_good_is_worth_nothing(played, monkeypatch):
     """The critic reads the states that falls left behind, too, with the reward of the fall and no return to go."""
     fallen = np.zeros(40, bool)

@@ -243,8 +243,8 @@ def init(
 
 
 def from_world(world: World, config: Config) -> dict[str, PyTree]:
-    """What states are worth and, where the generator follows it, the barrier."""
-    return {"critic": world.values.critic} | ({"barrier": world.barrier} if follows(config) else {})
+    """The barrier, where the generator follows it."""
+    return {"barrier": world.barrier} if follows(config) else {}
 
 
 def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 8192) -> normalise.Normaliser:
@@ -636,14 +636,12 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     return Planner(
         networks={name: net for name, net in state["ema"].items() if name != "clones"},
         normaliser=state["frozen"]["normaliser"],
-        critic=state["world"]["critic"],
         alpha_bar=tuple(schedule(config).tolist()),
         horizon=config.horizon,
         history=config.history,
         prediction=config.prediction,
         dim=config.noisy_input == "signal",
         clip=config.clip,
-        discount=config.discount,
         observe=config.observe,
         drivers=config.searched,
         carries_own=carries_own(config, feature_map),

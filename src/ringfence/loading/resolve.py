@@ -29,7 +29,7 @@ from ringfence.types import Policy, PyTree, Spec
 from ringfence.utils.config import build_config
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
-from ringfence.world.verdict import judge, require
+from ringfence.world.verdict import judge, require, require_values
 
 _log = logging.getLogger(__name__)
 
@@ -154,22 +154,27 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
     alone = policy.options.execution == "decentralized"  # a World sees the whole team
     follows = policy.options.replan > 1  # and so steps that nothing guided
     by_itself = asked is None and getattr(job.config, "guides", False) and not (corrected or alone or follows)
-    if not asked and not by_itself:
+    climbs = policy.options.value_guidance > 0
+    if not (asked or by_itself or climbs):
         return policy
     world = read
-    if asked and (read is None or spec.world is not None):
+    if (asked or climbs) and (read is None or spec.world is not None):
         world = worlds.for_guard(run, None, spec.world, read=read)
-    if world is None or (world.barrier is None and not asked):
+    if world is None or (world.barrier is None and not (asked or climbs)):
         return policy
     _check_width(job, world.map, "The World")
-    if asked:
+    if climbs:
+        require_values(world.card, spec.anyway)
+    if asked or (climbs and world.barrier is not None):
         require(world.card, spec.anyway)
-    elif (world.card.verdict or judge(world.card)).word == "unfit" and not spec.anyway:
+    elif not climbs and (world.card.verdict or judge(world.card)).word == "unfit" and not spec.anyway:
         _log.warning(
             f"The World of '{run.path}' is unfit to guide by, so plans are drawn without it; insist with anyway=True, "
             "or set barrier_guidance=0."
         )
         return policy
+    if not (asked or by_itself) or world.barrier is None and not asked:
+        return guided(policy, world, 0.0)
     return guided(policy, world, WHOLE if asked is None else asked)
 
 

@@ -26,7 +26,7 @@ from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
 
 WAVES = 4  # sines and cosines of τ
-UNREAD = ("sampler", "value_guidance", "persist", "reconcile", "replan", "execution")  # options of plans of states
+UNREAD = ("sampler", "value_guidance", "reconcile", "replan", "execution")  # options of plans of states
 
 
 def time_entries(tau: Array) -> Array:

@@ -7,7 +7,6 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from ringfence.errors import UserError
 from ringfence.proposals import diffusion
 from ringfence.utils.config import AtLeastOne, Count, NonNegative, check_bounds
 
@@ -22,8 +21,8 @@ class PlanOptions:
     target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %; of the largest, if raw
     temperature: NonNegative = 1.0  # scale of the first noise
     spread: NonNegative = 1.0  # by which it is multiplied for the last of several plans that are drawn together
-    value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
-    persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
+    # how far actions, in [−1, 1], move up a World's values in each of six rounds of every sampling step; 0: none
+    value_guidance: NonNegative = 0.0
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     # share of a step to the World's margin, in every sampling step; 0: none; None: as the method has it (icbf: 1), and
     # none under a guard that corrects actions anyway
@@ -33,8 +32,6 @@ class PlanOptions:
 
     def __post_init__(self):
         check_bounds(self)
-        if self.persist != 1.0 and not self.value_guidance:
-            raise UserError(f"persist={self.persist} is read by nothing that was asked for; set value_guidance.")
 
     def temperatures(self, count: int) -> np.ndarray:
         """(count,) of plans that are drawn together, to choose from or to refine: the first is as of one alone."""
@@ -68,8 +65,8 @@ DEFAULT = "default"
 # Named sets of evaluation-time choices, made on validation resets; docs/options.md.
 PLANNERS: dict[str, dict] = {
     DEFAULT: {},
-    # Value steers the samples.
-    "value_guided": {"sampling_steps": 10, "cfg_scale": 1.0, "value_guidance": 100.0, "persist": 0.5},
+    # A World's values steer the samples.
+    "value_guided": {"value_guidance": 0.5},
     # MADIFF at inference (Zhu et al. 2024), for runs whose condition is `raw`.
     "published": {"temperature": 0.5},
     # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no

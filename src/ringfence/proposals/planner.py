@@ -29,14 +29,13 @@ from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
 from ringfence.proposals.drivers import classifier_free, draw, several
-from ringfence.proposals.guidance import cleared, lacking
+from ringfence.proposals.guidance import AHEAD_ROWS, cleared, climbed, lacking, worth
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
-from ringfence.world.values import Critic, plan_value
 
 ROUNDS = 2  # of guidance in every sampling step: one leaves a tenth of a collision an episode, three do no better
-MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
+CLIMBS = 6  # rounds of value guidance in every sampling step
 
 
 class Planner(eqx.Module):
@@ -44,22 +43,20 @@ class Planner(eqx.Module):
 
     networks: dict[str, Any]  # denoiser, inverse; mean, prior and barrier where there are such
     normaliser: Normaliser
-    critic: Critic  # what states are worth
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     history: int = eqx.field(static=True)
     prediction: diffusion.Prediction = eqx.field(static=True)
     dim: bool = eqx.field(static=True)  # the denoiser is shown noisy entries × √ᾱ_k
     clip: float = eqx.field(static=True)
-    discount: float = eqx.field(static=True)
     observe: str = eqx.field(static=True)  # whose present was known in training
     drivers: int = eqx.field(static=True)  # that it may plan as, one for an episode; 0: nobody in particular
     carries_own: bool = eqx.field(static=True)  # plans hold own entries only; the rest is recomputed
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
-    world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
-    guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
+    world: World | None = None  # that guides the sampling, by its danger or its values
+    guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step away from danger
     ahead: bool = eqx.field(static=True, default=True)  # and by V, too
 
     @property
@@ -75,11 +72,12 @@ class Planner(eqx.Module):
             )
         if self.carries_own and not o.reconcile:
             raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
-        if o.barrier_guidance and o.execution == "decentralized":
-            raise UserError(
-                f"barrier_guidance={o.barrier_guidance} asks a World that sees the whole team, which "
-                "execution='decentralized' does not; leave one of them out."
-            )
+        for name in ("barrier_guidance", "value_guidance"):
+            if getattr(o, name) and o.execution == "decentralized":
+                raise UserError(
+                    f"{name}={getattr(o, name)} asks a World that sees the whole team, which "
+                    "execution='decentralized' does not; leave one of them out."
+                )
         if o.barrier_guidance and o.replan > 1:
             raise UserError(
                 f"barrier_guidance={o.barrier_guidance} guides the first step of a plan, and replan={o.replan} follows "
@@ -122,8 +120,7 @@ class Planner(eqx.Module):
     def propose(
         self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
-        """(carry, actions (B, `count`, `rows`, N, A) in [−1, 1], info): what inverse dynamics does to track plans,
-        along the rows that the World foresees if it reads the same view, else along the plans themselves."""
+        """(carry, actions (B, `count`, `rows`, N, A) in [−1, 1], info): what inverse dynamics does to track plans."""
         if self.options.replan > 1:
             raise UserError("A guard decides at every step; use replan=1.")
         if rows > self.rows_planned:
@@ -136,12 +133,8 @@ class Planner(eqx.Module):
         who = self._several(carry, present, key, count)
         plans = self.plans(past, present, key, count, who, self._judged(observations, state))
         flat = plans.reshape(-1, *plans.shape[2:])
-        x, tracks, actions = flat[:, self.history], world.map.names == self.feature_map.names, []
-        for row in range(self.history + 1, self.history + 1 + rows):
-            action = infer_action(self.networks["inverse"], self.normaliser, x, flat[:, row])
-            actions.append(jnp.clip(action, -1.0, 1.0))
-            x = world.dynamics.step(x, actions[-1])[0] if tracks else flat[:, row]
-        actions = jnp.stack(actions, 1).reshape(*plans.shape[:2], rows, *actions[0].shape[1:])
+        actions = self.tracked(flat[:, self.history], flat[:, self.history + 1 : self.history + 1 + rows], world)
+        actions = actions.reshape(*plans.shape[:2], *actions.shape[1:])
         return self._kept(carry, past, present, plans[:, 0]), actions, {}
 
     def _context(self, carry: PyTree, observations: Array, state: Array | None) -> tuple[Array, Array]:
@@ -234,13 +227,9 @@ class Planner(eqx.Module):
 
         def steered(z: Array, k: Array) -> Array:
             clean = made.plan(made.predict(z, k))
-            if o.value_guidance > 0:
-                slope = jax.grad(lambda c: self.merit(made.inpaint(c)).sum())(clean)
-                size = jnp.sqrt((slope**2).sum((1, 2, 3), keepdims=True))
-                slope = slope * jnp.minimum(1.0, MAX_SLOPE / jnp.maximum(size, 1e-9))
-                level = (1.0 - jnp.asarray(bar, jnp.float32)[k]) ** o.persist
-                clean = jnp.clip(made.inpaint(clean + level[:, None, None, None] * slope), -self.clip, self.clip)
-            if judged is not None:
+            if o.value_guidance:
+                clean = self._climbed(made, context[:, -1], judged, clean)
+            if self.guidance:
                 short = partial(self._short_of_margin, made, context[:, -1], judged)
                 clean = cleared(short, clean, self.guidance, ROUNDS)
             if o.reconcile:
@@ -257,14 +246,30 @@ class Planner(eqx.Module):
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         return lacking(self, judged, action)
 
+    def _climbed(self, made: Generator, present: Array, judged: Array | None, clean: Array) -> Array:
+        """Plans (B, rows, N, D) whose actions are worth more to the World."""
+        assert judged is not None, "a World guides what values guide"
+        rows = min(self.rows_planned, AHEAD_ROWS)
+
+        def actions_of(x: Array) -> Array:
+            plan = self.agreed(self.normaliser.invert(made.inpaint(x)))[:, self.history + 1 :]
+            return self.tracked(present, plan[:, :rows], self.world)
+
+        how = (self.options.value_guidance, CLIMBS)
+        return climbed(actions_of, lambda actions: worth(self, judged, actions), clean, *how)
+
+    def tracked(self, present: Array, rows: Array, world: World) -> Array:
+        """Actions (B, K, N, A) in [−1, 1] by which inverse dynamics tracks `rows` (B, K, N, D) of plans from the
+        present (B, N, D): along what the World foresees, if it reads the same view, else along the plans."""
+        same, x, actions = world.map.names == self.feature_map.names, present, []
+        for row in jnp.moveaxis(rows, 1, 0):
+            actions.append(jnp.clip(infer_action(self.networks["inverse"], self.normaliser, x, row), -1.0, 1.0))
+            x = world.dynamics.step(x, actions[-1])[0] if same else row
+        return jnp.stack(actions, 1)
+
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
         return self.feature_map.agreed(x, self.history) if self.options.reconcile else x
-
-    def merit(self, clean: Array) -> Array:
-        """(B,) what gradient guidance climbs: value in deviations of the data's."""
-        ahead = self.agreed(self.normaliser.invert(clean))[:, self.history + 1 :]
-        return self.options.value_guidance * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]
 
 
 @dataclass(frozen=True)

@@ -234,10 +234,3 @@ def values_of(critic: Critic, features: Array) -> np.ndarray:
 @jax.jit
 def _state_value(critic: Critic, x: Array) -> Array:
     return state_values(critic, x)[1]
-
-
-def plan_value(critic: Critic, rows: Array, discount: float) -> Array:
-    """Σ_{h<H} γ^h r̂(row_h) + γ^H V̂(row_{H−1}) of plans (..., H, N, D) without their present row, in data units."""
-    reward, value = state_values(critic, rows)
-    weight = discount ** jnp.arange(reward.shape[-1])
-    return (reward * weight).sum(-1) + weight[-1] * discount * value[..., -1]

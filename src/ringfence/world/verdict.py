@@ -209,8 +209,8 @@ def require_values(card: Card, anyway: bool = False) -> None:
     if card.values is None or not card.values.misleads or anyway:
         return
     raise UserError(
-        f"The World of '{card.data.task}' predicts returns-to-go worse than by their mean, and this guard climbs them; "
-        "take guard='shield', log more episodes, or insist with anyway=True (--anyway)."
+        f"The World of '{card.data.task}' predicts returns-to-go worse than by their mean, and these options climb "
+        "them; take guard='shield', leave value_guidance out, log more episodes, or insist with anyway=True (--anyway)."
     )
 
 
