@@ -306,20 +306,18 @@ def of_systems() -> tuple[bool, str]:
 
 @on("results/proving/again")
 def of_again() -> tuple[bool, str]:
-    """Systems that were played again by Worlds of today, of seed 0: who is left in more than one episode of 60."""
-    found = {
-        file.stem.removeprefix("proving-"): of_json(file) for file in (RESULTS / "proving" / "again").glob("*.json")
-    }
+    """Systems that were played by Worlds of today, of two seeds: whom they leave in more than one episode of 60."""
+    found = {one["task"].removeprefix("proving-"): one for one in proven("proving/again")}
     rates = {
-        who: {name: one["rows"][f"{who} shield learned"]["violation_rate"] for name, one in found.items()}
+        who: {name: one["rows"][f"{who} shield learned"]["most"] for name, one in found.items()}
         for who in ("bc", "naive")
     }
-    fit = [name for name, one in found.items() if one["verdict"] == "fit"]
+    fit = [name for name, one in found.items() if one["verdicts"] == ["fit", "fit"]]
+    refused = [name for name, one in found.items() if one["verdicts"] == ["unfit", "unfit"]]
     left = {name: rates["naive"][name] for name in fit if rates["naive"][name] > 1.5 / 60}
     text = f"{len(fit)} of {len(found)} fit; clones {max(rates['bc'][n] for n in fit):.3f} at most; naive {left}"
-    return (len(found), len(fit)) == (16, 14) and sorted(left) == ["bench", "gears"] and not any(
-        rates["bc"][name] for name in fit
-    ), text
+    holds = (len(found), len(fit), refused) == (16, 14, ["arms", "train"]) and sorted(left) == ["bench", "gears"]
+    return holds and not any(rates["bc"][name] for name in fit), text
 
 
 @on("results/proving")
@@ -929,7 +927,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
     "README.md": {
         "earns more than the logs of one learner, and of five": planner_reaches(LEARNER, 1.05, 0.1),
         "The safety comes from the guard": shielded_all,
-        "On fourteen of sixteen systems a guarded clone violates in at most 1 % of its episodes": of_systems,
+        "On fourteen of sixteen systems a guarded clone never violates": of_again,
         "Print earns more than ours as it is on twelve of thirteen tasks": print_earns_more,
         "exceeds no limit; ours exceeds two": some_exceed,
     },
