@@ -686,6 +686,9 @@ def test_files_of_strangers(tmp_path, in_time):
     parquet.write_table(pa.table(row_table(hit=times)), tmp_path / "a.parquet")
     with pytest.raises(UserError):
         tabled(tmp_path / "a.parquet")
+    file.write_text(",".join(map(str, range(60_000))) + "\n")
+    with pytest.raises(UserError, match="more than 50,000 columns; leave out"):
+        tabled(file)
     runs = pa.table({name: np.zeros(20_000_000, np.float32) for name in ("t", "id", "x", "y", "hit")})
     parquet.write_table(runs, tmp_path / "runs.parquet")
     del runs
@@ -818,12 +821,19 @@ def test_fields_of_importers_files(name, tmp_path):
 
 @pytest.mark.parametrize(
     ("agents", "options", "said"),
-    [(1000, {}, ""), (3000, {}, "1.1 GiB; let agents see fewer others, .* neighbours"), (3000, {"neighbours": 6}, "")],
+    [
+        (1000, {}, ""),
+        (3000, {}, "1.1 GiB; let agents see fewer others, .* neighbours"),
+        (3000, {"neighbours": 6}, ""),
+        (30_000, {}, "GiB; let agents see fewer others"),
+        (30_000, {"terminated": "end"}, "No 30000 agents are together for 5 steps"),
+        (30_000, {"neighbours": 2}, ""),
+    ],
 )
 def test_a_small_table_takes_no_large_memory(agents, options, said):
     """Of everybody's observations of everybody else, which are refused where there are too many."""
     who, step = np.divmod(np.arange(8 * agents), 8)
-    table = {"t": 0.1 * step, "id": who, "x": 1.0 * who, "y": 1.0 * step}
+    table = {"t": 0.1 * step, "id": who, "x": 1.0 * who, "y": 1.0 * step, "end": step % 2}
     tracemalloc.start()
     try:
         EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], **options)

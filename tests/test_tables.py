@@ -151,7 +151,7 @@ def test_long_windows_are_cut_and_short_ones_left_out():
     assert cut(np.array([11, 3]), 1, None)[1].tolist() == [11, 3]
 
 
-def test_neighbours_are_those_who_are_nearest_at_that_time():
+def test_neighbours_are_those_who_are_nearest_at_that_time(monkeypatch):
     rng = np.random.default_rng(3)
     there = rng.random((2, 15, 6)) < 0.7
     there[:, :, 0] = True
@@ -167,6 +167,17 @@ def test_neighbours_are_those_who_are_nearest_at_that_time():
         far = np.linalg.norm(tracks.state - tracks.state[row], axis=1)
         wanted = [k for k in np.flatnonzero(same)[np.argsort(far[same])] if far[k] <= 2.0][:3]
         assert got[row].tolist() == wanted + [-1] * (3 - len(wanted))
+    monkeypatch.setattr("ringfence.logs.io.tracks.CHUNK", 9)  # so that moments of four are of many
+    np.testing.assert_array_equal(nearest(tracks, tracks.state, 3, 2.0), got)
+
+
+def test_crowds_at_one_place_have_neighbours():
+    """Their tree is none of one leaf, in which everybody looks at everybody."""
+    many, zeros = 2500, np.zeros(2500)
+    who = np.arange(many)
+    tracks = resample(0 * who, who, zeros, zeros[:, None], zeros[:, None], zeros, zeros[:, None], zeros > 0, 1.0, 9.0)
+    got = nearest(tracks, tracks.state, 2, 1.0)
+    assert (np.abs(got - who[:, None]) <= 2).all() and (got != who[:, None]).all() and (got >= 0).all()
 
 
 def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):

@@ -27,6 +27,7 @@ LINES = (".jsonl", ".ndjson")
 PARQUET = (".parquet", ".pq")
 KINDS = (".csv", *PARQUET, *LINES, *READERS)
 LONGEST = 1000  # entries of a list
+WIDEST = 50_000  # columns of text, each of which takes kilobytes before its first row
 LINE = 40  # bytes of a row of text, about
 BLOCK = 2**24  # bytes of text that are read at once
 COMMA = re.compile(r"[+-]?(\d+(,\d*)?|,\d+)([eE][+-]?\d+)?")
@@ -369,6 +370,8 @@ def _of_csv(
         lines = (line for line in file if line.strip() and not line.startswith("#"))
         head = next(lines, "") if form.header else file.readline(2**20)
         separator = max(",;\t|", key=head.count)  # the first of those that separate as often
+        if head.count(separator) >= WIDEST:
+            raise StoreError(f"'{path}' has more than {WIDEST:,} columns; leave out those that nobody needs.")
         source: Any = path
         if form.header:
             spaces = separator not in head
