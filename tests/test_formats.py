@@ -321,6 +321,7 @@ def test_a_file_of_a_data_set_is_a_table_of_named_lists(tmp_path):
         ({"features": 3}, (), "no info.json that LeRobot writes"),
         ({"features": {}}, (), "column of the data set 'observation.state'"),
         ({}, ("left_", "left_"), "names one twice"),
+        ({}, [5], "arms is a int; give prefixes"),
         ({}, ("left_",), "The action 'right_waist' begins with none of left_"),
         ({}, ("left_", "right_waist", "right_e", "right_g"), "arms need the same entries"),
     ],
@@ -329,6 +330,43 @@ def test_data_sets_that_cannot_be_are_refused(tmp_path, changed, arms, said):
     lerobot(tmp_path / "set", **changed)
     with pytest.raises(UserError, match=said):
         read_lerobot(tmp_path / "set", arms)
+
+
+def rewritten(folder, **columns):
+    """The data set of `lerobot` with other columns, which meta/info.json names, too."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    lerobot(folder)
+    file, info = folder / "data" / "chunk-000" / "file-000.parquet", folder / "meta" / "info.json"
+    table, said = parquet.read_table(file), json.loads(info.read_text())
+    for name, column in columns.items():
+        table = (table.drop([name]) if name in table.column_names else table).append_column(name, pa.array(column))
+        said["features"][name] = {"dtype": "float32", "shape": [1]}
+    parquet.write_table(table, file)
+    info.write_text(json.dumps(said))
+    return folder
+
+
+def test_an_end_inside_of_a_lerobot_episode_cuts_it(tmp_path):
+    whole = read_lerobot(rewritten(tmp_path / "whole", **{"next.done": np.isin(np.arange(21), [11, 20])}))
+    one = read_lerobot(rewritten(tmp_path / "set", **{"next.done": np.isin(np.arange(21), [4, 11, 20])}))
+    assert not whole.notes and one.notes == ("next.done is set inside of episodes, which are cut there: 1 times",)
+    assert np.flatnonzero(np.diff(one.columns["episode"][:21])).tolist() == [4, 11]
+    np.testing.assert_array_equal(one.columns["reward"][[4, 5, 6]], [3, 0, 5])  # the last frame's leads nowhere
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"frame_index": 1000 * np.r_[0:12, 0:9]}, "frame_index goes up by 1000 from row to row"),
+        ({"next.reward": [[1.0, 2.0]] * 21}, "next.reward holds lists of 2 entries"),
+        ({"next.done": ["yes"] * 21}, "next.done is 'yes', no number"),
+    ],
+)
+def test_columns_of_data_sets_that_contradict_the_format_are_refused(tmp_path, columns, said):
+    with pytest.raises(UserError, match=said):
+        read_lerobot(rewritten(tmp_path / "set", **columns))
 
 
 def test_folders_that_are_no_data_sets_are_refused(tmp_path):

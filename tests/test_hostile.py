@@ -744,6 +744,18 @@ def test_some_of_what_is_tried_by_the_thousand(kind, tmp_path):
         ({"terminations": {"a": 0.5, "b": False}}, "neither true nor false"),
         ({"infos": {"a": -1.0}}, "gave a the info '-1.0'; infos are a dict of each agent"),
         ({"step": np.array(1.0)}, "returned 1 things"),
+        (
+            {"observations": dict.fromkeys("ab", np.ones(2))},
+            "has shape .2, 2., Simulator, as it began, takes .2, 3.; show",
+        ),
+        (
+            {"observations": dict.fromkeys("ab", np.ones(4))},
+            "has shape .2, 4., Simulator, as it began, takes .2, 3.; show",
+        ),
+        *(
+            ({"infos": dict.fromkeys("ab", {"cost": {name: 1.0}})}, "name at most 100, each without slashes")
+            for name in ("", "a/b", "\x1b[2J", "\ud800", "x" * 121)
+        ),
     ],
 )
 def test_answers_of_simulators_that_are_none(odd, said):
@@ -889,6 +901,14 @@ def test_metrics_and_constants_of_strangers(trained_run, tmp_path):
         file.mkdir()
     with pytest.raises(UserError, match="holds no checkpoint"):
         load(run)
+
+
+def test_nothing_is_added_that_makes_a_file_unreadable(trained_run, tmp_path):
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "run"))
+    before = run.results
+    with pytest.raises(UserError, match="could not be read again .*nothing was added"):
+        run.add_result("default", {"constraints": {"\ud800": {}}})
+    assert run.results == before
 
 
 THINGS = [3, None, [], {}, b"x", len, np.zeros(3)]

@@ -294,6 +294,12 @@ def test_tables_that_cannot_be_are_refused(table, options, said):
         EpisodeStore.from_table(table, **NAMES | options)
 
 
+def test_steps_that_a_large_table_has_too_few_rows_for_are_refused():
+    rows = np.arange(20_000.0)
+    with pytest.raises(UserError, match=r"Steps of 0.005 s would be 4e\+06 for 20,000 rows; give a larger dt"):
+        EpisodeStore.from_table({"t": rows, "id": 0 * rows, "x": rows}, time="t", agent="id", state=["x"], dt=0.005)
+
+
 def test_files_that_are_no_tables_are_refused(tmp_path):
     odd = ("a.parquet", b"PAR1nonsense"), ("a.csv", b'x,y\n1,"2\n3'), ("a.xlsx", b"PK"), ("b.csv", b"t,t\n1,2\n")
     for name, content in odd:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from ringfence.envs.base import Outcome, Seen
 from ringfence.errors import UserError, of_kind
 from ringfence.problem.origins import NOWHERE, Origins
+from ringfence.utils import schemas
 from ringfence.utils.given import NUMBERS, given_as, refuse_other_order
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
@@ -114,6 +115,8 @@ class Episode:
             )
         self._check_count(begun[0])
         self._observe(begun[0])
+        states = shape.state if self.state is None else len(self.state)
+        self.shape = replace(shape, observation=self.seen.shape[1], state=states)  # of all that follows
 
     def _check_count(self, observations: ByAgent) -> None:
         """Refuse another number of agents; where they see something else, too, that is said first."""
@@ -226,6 +229,13 @@ class Episode:
 
     def _take_constraints(self, costs: Mapping[Any, Any]) -> None:
         """The step's cost by each constraint's name."""
+        try:
+            schemas.check({str(name): 0.0 for name in costs}, schemas.Limits)
+        except ValueError:
+            raise UserError(
+                f"Step {len(self.rewards)} of {self.name} tells costs of {str(list(costs))[:200]}; name at most 100, "
+                "each without slashes, line breaks or a leading dot or dash, of at most 120 letters."
+            ) from None
         self.constraints.append({str(k): self._of_agents(c, self.name) for k, c in costs.items()})
         names = list(self.constraints[0])
         now = list(self.constraints[-1])
@@ -285,7 +295,8 @@ class Episode:
     def _given(
         self, name: str, value: Any, shape: tuple[int | None, ...], origins: tuple[float, ...] | None
     ) -> np.ndarray:
-        return given_as(name, value, shape, origins=origins, double=self.shape.double)
+        begun = (f"{self.name}, as it began,", "show as many entries at every step") if self.rewards else ()
+        return given_as(name, value, shape, *begun, origins=origins, double=self.shape.double)
 
     def _refuse_without_state(self) -> None:
         if self.shape.needs_state:

@@ -28,6 +28,7 @@ FEW = 5  # rows whose times were rounded another way than most, below which none
 COARSEST = 0.62  # of a step, to which times may be rounded; coarser ones are of a clock that lost a third of its rows,
 SINGLE = 0.8  # but those of single precision, which are rounded to powers of two
 FINEST = 1000  # steps between two rows: more are another unit of time
+MANY = 10  # steps between two rows of a large table
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 STEADY = 0.5  # length of the mean phase of rows that keep their place between steps
 CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
@@ -259,7 +260,7 @@ class _Segments:
         begin = self.time[self.first]
         end = self.time[self.last]
         wanted = float(((end - begin) / dt + 1).sum())
-        if not wanted <= FINEST * (len(self.time) + FINEST):
+        if not wanted <= FINEST * FINEST + MANY * len(self.time):
             raise StoreError(
                 f"Steps of {dt:g} s would be {wanted:.3g} for {len(self.time):,} rows; give a larger dt (times are in "
                 "seconds)."
