@@ -7,6 +7,7 @@ import operator
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -91,6 +92,14 @@ def whole_number(name: str, value, low: int = 0, high: int = 10**9) -> int:
     if isinstance(value, bool) or number is None or not low <= number <= high:
         raise UserError(f"{name}={str(value)[:60]} must be a whole number from {low:,} to {high:,}.")
     return number
+
+
+def above_zero(name: str, value: Any, unit: str) -> float:
+    """A finite number that somebody gave, above 0; anything else is refused by its name."""
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    if not number or not 0 < value < float("inf"):
+        raise UserError(f"{name}={value!r:.60} must be a number of {unit} above 0.")
+    return float(value)
 
 
 def of_kind(name: str, value: Any, kind: Any, remedy: str) -> None:
