@@ -713,6 +713,12 @@ def test_names_that_hold_no_unit_are_left_alone():
         ("11/13/2015 23:59:{:02d}", "time_format", "%m/%d/%Y %H:%M:%S"),
         ("13.11.2015 23:59:{:02d}.5", "time_format", "%d.%m.%Y %H:%M:%S.%f"),
         ("10:00:{:02d}", "time_format", "%H:%M:%S"),
+        ("25/03/2024 11:59:{:02d} PM", "time_format", "%d/%m/%Y %I:%M:%S %p"),
+        ("25/03/24 23:59:{:02d}", "time_format", "%d/%m/%y %H:%M:%S"),
+        ("25/03/2024, 23:59:{:02d}", "time_format", "%d/%m/%Y, %H:%M:%S"),
+        ("25/03/2024T23:59:{:02d}Z", "time_format", "%d/%m/%YT%H:%M:%S%z"),
+        ("25-Mar-2024 23:59:{:02d}", "time_format", "%d-%b-%Y %H:%M:%S"),
+        ("Mon Mar 25 23:59:{:02d} 2024", "time_format", "%a %b %d %H:%M:%S %Y"),
         ("1{:02d},5", "decimal", ","),
     ],
 )
@@ -723,6 +729,16 @@ def test_what_is_no_number_is_told_how_to_be_one(tmp_path, entry, option, wanted
         EpisodeStore.from_table(file, **ALONE)
     store = EpisodeStore.from_table(file, **ALONE, **{option: wanted})
     assert store.card.dt == 1.0 and store.steps == 19
+
+
+@pytest.mark.parametrize("kind", [np.int64, float, str])
+def test_dates_of_digits_alone_are_no_seconds(kind):
+    """As seconds they would jump at every minute."""
+    times = np.array([20240325235950 + k for k in range(10)] + [20240326000000 + k for k in range(10)])
+    table = {"t": times.astype(kind), "id": np.zeros(20), "x": np.arange(20.0), "y": np.zeros(20)}
+    with pytest.raises(StoreError, match=r"row 0: t is .*20240325235950.*, .*time_format='%Y%m%d%H%M%S'"):
+        EpisodeStore.from_table(table, **ALONE)
+    assert EpisodeStore.from_table(table, **ALONE, time_format="%Y%m%d%H%M%S").steps == 19
 
 
 def test_rows_are_sorted_where_that_is_asked_for(tmp_path):

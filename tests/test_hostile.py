@@ -24,19 +24,21 @@ from safetensors.numpy import save_file
 import ringfence
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
+from ringfence.datasets import importers
 from ringfence.datasets.audit import audit
 from ringfence.deploy.controller import Controller
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import StoreError, UserError
 from ringfence.evaluation import recordings
-from ringfence.evaluation.certificate import Certificate
+from ringfence.evaluation.certificate import Certificate, Monitor
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
 from ringfence.loading.resolve import load
+from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
-from ringfence.problem.constraints import Separation, SpeedLimit
-from ringfence.report import board
+from ringfence.problem.constraints import All, Separation, SpeedLimit
+from ringfence.report import board, build_report
 from ringfence.report.table import normal_return, sections
 from ringfence.training.runs import Run
 from tests import corpus, strange, strange_files
@@ -358,6 +360,7 @@ def test_ctrl_c_ends_what_does_not_hear_it_and_leaves_nothing_half_written(withi
         begun = time.monotonic()
         said = asked.communicate(timeout=60)[1]
     assert asked.returncode == 130 and "interrupted" in said and "Traceback" not in said
+    assert "checkpoint" not in said, "that command keeps none"
     assert seconds[0] <= time.monotonic() - begun < seconds[1] and not list(tmp_path.iterdir())
 
 
@@ -928,6 +931,16 @@ def test_things_of_other_kinds_are_refused_by_name(value, tmp_path):
         lambda: ringfence.train(value, store),
         lambda: store.followed_by(value),
         lambda: EpisodeStore.from_layout(table, value),
+        lambda: build_report(value, tmp_path / "a.html"),
+        lambda: importers.import_hdf5(value),
+        lambda: importers.import_omar(value),
+        lambda: importers.import_vault(value, "ant_2x4"),
+        lambda: read_lerobot(value),
+        lambda: All((value,)),
+        lambda: Monitor(value),
+        lambda: ringfence.collect(value, episodes=1),
+        lambda: observe({"observation_names": ["own.x"], "agents": 3}, {"x": [1.0]}),
+        lambda: observe({"observation_names": [value]}, {"x": [1.0]}),
     ]
     if value not in (None, {}) if not isinstance(value, np.ndarray) else True:
         asked.append(lambda: EpisodeStore.from_table(table, **how, card=value))
@@ -946,6 +959,7 @@ def test_things_of_other_kinds_are_refused_beside_a_run(value, trained_run, tmp_
     store, simulator, run = corpus.small_store(), SimpleSpreadParallel, trained_run
     asked = {
         **{name: lambda name=name: Controller(run, **{name: value}) for name in ("guard", "planner", "certificate")},
+        "array": lambda: Controller(run, guard=np.zeros(3)),
         "world": lambda: Controller(run, guard="shield", world=value),
         "Certificate": lambda: Certificate.load(value),
         "Run": lambda: Run(value),
@@ -992,8 +1006,10 @@ def test_names_that_are_missing_are_no_agents():
     times = np.array(["NaT", "2020-01-01"], "datetime64[s]")
     with pytest.raises(UserError, match="row 0: id is missing"):
         strange.tabled(strange.columns(id=np.repeat(times, 20)))
-    for days in ("datetime64[Y]", "datetime64[M]"):
-        with pytest.raises(UserError, match="counts years or months"):
+    with pytest.raises(UserError, match=r"id has shape \(40, 1\); give one entry per row"):
+        strange.tabled(strange.columns(id=np.repeat([[0], [1]], 20, 0)))
+    for days in ("datetime64[Y]", "datetime64[M]", "datetime64[as]"):
+        with pytest.raises(UserError, match="counts (years or months|attoseconds)"):
             strange.tabled(strange.columns(t=np.tile(np.arange(20), 2).astype(days)))
     with pytest.raises(UserError, match="row 0: t is"):
         strange.tabled(strange.columns(t=np.tile([f"0001-01-01T00:00:{k:02d}+14:00" for k in range(20)], 2)))

@@ -84,7 +84,7 @@ class Controller:
         keep_programs()
         promised = None if certificate is None else Certificate.load(certificate)
         if promised is not None:
-            if options.get("guard", "none") == "none":
+            if str(options.get("guard", "none")) == "none":
                 raise UserError(UNGUARDED)
             brought = CALIBRATED if {*LOOKS, "horizon_seconds"} & set(options) else CALIBRATED + LOOKS
             options = {name: promised.guard[name] for name in brought if name in promised.guard} | options

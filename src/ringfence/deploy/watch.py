@@ -238,7 +238,7 @@ class Stamps:
         now is given: deciding takes as long as it did lately."""
         if dt is None:
             raise UserError(
-                "observed_at needs a guard whose World knows how long a step takes (dt of its logs); give age= in steps."
+                "observed_at needs a guard whose World knows how long a step is (dt of its logs); give age= in steps."
             )
         stamps = np.asarray(observed_at)
         if stamps.dtype.kind not in "iuf" or stamps.shape not in ((), (agents,)) or not np.isfinite(stamps).all():

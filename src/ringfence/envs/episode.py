@@ -4,6 +4,7 @@ Simulators side by side are one `Env` (envs/base.py)."""
 
 from __future__ import annotations
 
+import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -58,11 +59,24 @@ def check(env: Any, *names: str) -> None:
 
 def made(make_env: Callable[[], Any], *names: str) -> Any:
     """A simulator that has these besides; what makes none is refused."""
-    if not callable(make_env):
-        raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
+    check_maker(make_env)
     env = make_env()
     check(env, *names)
     return env
+
+
+def check_maker(make_env: Any) -> None:
+    """Refuse what makes no simulator: what cannot be called, or not without arguments."""
+    kind = getattr(make_env, "__name__", type(make_env).__name__)
+    if not callable(make_env):
+        one = f"{kind}, or lambda: {kind}(...)" if hasattr(make_env, "step") else "the class, or a function without"
+        raise UserError(f"make_env is a {kind} and not what makes one; give {one}{' arguments' * (one[0] == 't')}.")
+    try:
+        inspect.signature(make_env).bind()
+    except TypeError as error:
+        raise UserError(f"make_env={kind} makes no simulator by itself ({error}); give lambda: {kind}(...).") from None
+    except ValueError:  # of some that are written in C nobody knows
+        pass
 
 
 def is_vector(space: Any) -> bool:

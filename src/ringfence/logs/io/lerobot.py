@@ -18,6 +18,7 @@ from ringfence.errors import StoreError, UserError, of_kind, one_of, reading
 from ringfence.logs.io.columns import Columns, Table, by_entry, known, numbers, reader, stacked
 from ringfence.logs.io.formats import names_in, read_parquet
 from ringfence.utils import schemas
+from ringfence.utils.files import place
 from ringfence.utils.text import natural
 
 INFO = "meta/info.json"
@@ -47,7 +48,7 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     """The table of a data set. `arms` are prefixes of entries' names: each is an agent, whose entries are called alike
     without it (`left_waist` and `right_waist`). By default `left` and `right`, where every action begins with one of
     them, else the robot is one agent. Entries of the state without such a prefix are every arm's."""
-    folder = Path(folder)
+    folder = place(folder)
     info = read_info(folder / INFO)
     wanted = [*state, ACTION]
     for name in wanted:

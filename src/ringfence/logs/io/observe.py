@@ -14,6 +14,7 @@ from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import SPACE, Entries, Entry
 from ringfence.problem.partners import others
+from ringfence.utils import schemas
 from ringfence.utils.given import given_as, refuse_other_order
 
 
@@ -34,6 +35,10 @@ def observe(
     of_kind("state", state, Mapping, "give a dictionary of columns, with one number of each agent")
     of_kind("goal", goal, Mapping | None, "give a dictionary of columns, with one number of each agent")
     fields = card.to_dict() if isinstance(card, StoreCard) else card
+    try:
+        schemas.check(dict(fields), schemas.Data)
+    except ValueError as error:
+        raise UserError(f"card is none of a store ({error}); give that of one which from_table made.") from None
     names: list[str] = list(fields.get("observation_names") or ())
     if not names:
         raise UserError("card names no observations; give that of a store which from_table made.")
