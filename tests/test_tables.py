@@ -278,6 +278,11 @@ def broken(**columns):
         (broken(run=(4, 3)) | {"id": np.array([None, *fleet()["id"][1:]], object)}, {}, "row 0: id is missing"),
         (fleet(), {"action_low": 0.0}, "action_low is said by the card, not by the table; give card={'action_low'"),
         (fleet(), {"dt": 0.0}, "dt=0.0 must be a number above 0"),
+        (
+            fleet() | {"end": np.arange(len(fleet()["t"])) % 2},
+            {"terminated": "end", "sort": True},
+            "ends an .* every row",
+        ),
         (fleet(), {"goal": ["gx"]}, "goal names 1 columns, the position has 2"),
         (fleet(), {"danger": CostColumn(), "cost": None}, "danger=CostColumn is not read from a table"),
         (fleet(), {"state": ["vx", "vy"], "danger": Separation(1.0), "cost": None}, "state holds no x, y or z"),

@@ -606,7 +606,7 @@ COMMANDS = {
 }
 
 
-KEEPING = (["train"], ["bench"], ["demo"])  # those that keep checkpoints
+KEEPING = (["train"], ["fit"], ["bench"], ["demo"])  # those that keep what is finished
 
 GROUPS: dict[str, tuple[dict[str, Any], str]] = {
     "data": (data_commands.COMMANDS, "Episode stores: make, import, inspect."),

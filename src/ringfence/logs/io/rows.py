@@ -109,7 +109,10 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
         raise StoreError(
             f"No agent has two rows; check that {schema.agent} tells agents and {schema.time} their times."
         )
-    return rows if schema.homogeneous else _ended_together(rows)
+    together = rows if schema.homogeneous else _ended_together(rows)
+    if not together.follows.any():
+        raise StoreError(f"{schema.terminated} ends an episode at every row, so that none has a step; check its flags.")
+    return together
 
 
 def _ended_together(rows: Rows) -> Rows:
