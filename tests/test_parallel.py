@@ -194,9 +194,11 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         play(run, lambda: shared, episodes=2)
     with pytest.raises(UserError, match="SimpleSpreadParallel and not what makes one; give SimpleSpreadParallel"):
         play(run, shared)
-    for wrong, said in ((5, "give the class, or a function"), (os.system, "'command'.; give lambda: system")):
+    for wrong, said in ((5, "give the class, or a function"), (os.system, "'command'.; give a function without")):
         with pytest.raises(UserError, match=said):
             play(run, wrong)
+    with pytest.raises(UserError, match="system makes no simulator by itself"):
+        simulator("os:system")
     with pytest.raises(UserError, match="still is a function and no run; give ringfence.guard"):
         play(still, SimpleSpreadParallel)
     with pytest.raises(UserError, match="episodes=0 must be a whole number from 1"):

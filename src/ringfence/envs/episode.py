@@ -74,7 +74,9 @@ def check_maker(make_env: Any) -> None:
     try:
         inspect.signature(make_env).bind()
     except TypeError as error:
-        raise UserError(f"make_env={kind} makes no simulator by itself ({error}); give lambda: {kind}(...).") from None
+        raise UserError(
+            f"{kind} makes no simulator by itself ({error}); give a function without arguments that makes one."
+        ) from None
     except ValueError:  # of some that are written in C nobody knows
         pass
 

@@ -346,6 +346,7 @@ def simulator(name: str) -> NamedSimulator:
         raise UserError(
             f"'{where}' has no {attribute} that can be called; name the class, or the function, that makes one."
         )
+    check_maker(make)
     return NamedSimulator(name, make)
 
 
