@@ -194,7 +194,10 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         play(run, lambda: shared, episodes=2)
     with pytest.raises(UserError, match="SimpleSpreadParallel and not what makes one; give SimpleSpreadParallel"):
         play(run, shared)
-    for wrong, said in ((5, "give the class, or a function"), (os.system, "'command'.; give a function without")):
+    for wrong, said in (
+        (5, "give the class, or a function, of a simulator"),
+        (os.system, "'command'.; give a function without"),
+    ):
         with pytest.raises(UserError, match=said):
             play(run, wrong)
     with pytest.raises(UserError, match="system makes no simulator by itself"):

@@ -16,6 +16,7 @@ LAST_SEED = 2**31 - 1  # that JAX takes everywhere
 LONGEST = 4000  # letters of a message
 SHOWN = 100  # names that a refusal lists
 LONG = 60  # letters of each of them
+FARTHEST = 1e30  # of numbers that count anything
 
 
 class UserError(ValueError):
@@ -96,10 +97,10 @@ def whole_number(name: str, value, low: int = 0, high: int = 10**9) -> int:
 
 def above_zero(name: str, value: Any, unit: str) -> float:
     """A finite number that somebody gave, above 0; anything else is refused by its name."""
-    number = isinstance(value, Real) and not isinstance(value, bool)
-    if not number or not 0 < value < float("inf"):
+    number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else 0
+    if not 0 < number < FARTHEST:
         raise UserError(f"{name}={value!r:.60} must be a number of {unit} above 0.")
-    return float(value)
+    return float(number)
 
 
 def of_kind(name: str, value: Any, kind: Any, remedy: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -44,8 +44,9 @@ def import_omar(
     """
     if task is not None:
         complete_card({"task": task})  # a name that cannot be one is refused before the files are read
-    single = not isinstance(directory, Sequence) or isinstance(directory, str)
-    directories = [place(d) for d in ([directory] if single else directory)]
+    single = isinstance(directory, str | os.PathLike) or not isinstance(directory, Iterable)
+    given: Any = [directory] if single else directory
+    directories = [place(d) for d in given]
     n = omar.check_alike(directories)
     task = _spread_task(directories, n, not single) if task is None else task
     known = _agents_of(task)

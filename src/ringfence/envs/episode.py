@@ -69,8 +69,9 @@ def check_maker(make_env: Any) -> None:
     """Refuse what makes no simulator: what cannot be called, or not without arguments."""
     kind = getattr(make_env, "__name__", type(make_env).__name__)
     if not callable(make_env):
-        one = f"{kind}, or lambda: {kind}(...)" if hasattr(make_env, "step") else "the class, or a function without"
-        raise UserError(f"make_env is a {kind} and not what makes one; give {one}{' arguments' * (one[0] == 't')}.")
+        own = f"{kind}, or lambda: {kind}(...)"
+        instead = own if hasattr(make_env, "step") else "the class, or a function, of a simulator"
+        raise UserError(f"make_env is a {kind} and not what makes one; give {instead}.")
     try:
         inspect.signature(make_env).bind()
     except TypeError as error:

@@ -56,8 +56,8 @@ class ChainedLog:
 
     def __init__(self, path: str | Path):
         self.path = writable(path)
-        there = self.path.exists() and self.path.stat().st_size > 0
-        found = check(self.path) if there else Checked(0, BEFORE_ALL, True)
+        there = self.path.exists()
+        found = check(self.path) if there and self.path.stat().st_size > 0 else Checked(0, BEFORE_ALL, True)
         self.records = found.records
         self.last = found.last
         try:

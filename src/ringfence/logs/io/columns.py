@@ -125,9 +125,10 @@ def seconds(columns: Columns, name: str) -> np.ndarray:
 
 def _reads_as_dates(numbers: np.ndarray) -> bool:
     """Whether all are fourteen digits of a year, month, day, hour, minute and second."""
-    rest, fits = np.floor(numbers), np.ones(len(numbers), bool)
+    finite = np.isfinite(numbers)
+    rest, fits = np.floor(np.where(finite, numbers, 0.0)), finite
     for size, least, most in ((100, 0, 60), (100, 0, 59), (100, 0, 23), (100, 1, 31), (100, 1, 12), (1e5, 1900, 2100)):
-        fits &= (rest % size >= least) & (rest % size <= most)
+        fits = fits & (rest % size >= least) & (rest % size <= most)
         rest = rest // size
     return bool(fits.all() and not rest.any())
 
@@ -136,7 +137,9 @@ def dates(name: str, column: np.ndarray, written: str | None = None) -> np.ndarr
     """A column of dates that are `written` as text (by default as ISO 8601) as dates; one of no dates as it is. Those
     with an offset are counted in UTC, and a column in which some have one is left to be refused."""
     if written is not None and (column.dtype.kind in "iu" or (column.dtype.kind == "f" and _reads_as_dates(column))):
-        column = column.astype(np.int64).astype(str)  # as the text that a file's would be
+        column = (column.astype(np.int64) if column.dtype.kind == "f" else column).astype(
+            str
+        )  # as the text that a file's would be
     if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
         return column
     read = [_date(entry, written) for entry in column.tolist()]

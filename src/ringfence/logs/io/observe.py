@@ -55,7 +55,7 @@ def observe(
     known = {e.source: e for e in Entries.of(names).each}
     places = 1 + max((e.order for e in known.values() if e.whose == "other" and e.order is not None), default=-1)
     whom = _seen_by_each(fields, columns, places)
-    now = _Now(columns, goals, whom, float(fields.get("sensing_radius", np.inf)))
+    now = _Now(columns, goals, whom, float(fields.get("sensing_radius") or np.inf))
     seen = np.stack([now.entry(name, known.get(d)) for d, name in enumerate(names)], 1)
     return seen if fields.get("observation_origins") else seen.astype(np.float32)
 
@@ -110,4 +110,4 @@ def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots
     zero = np.zeros(n, int)
     place = np.stack([columns[axis] for axis in SPACE if axis in columns], 1)
     now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, zero > 0, card.get("dt", 1.0))
-    return nearest(now, place, slots, float(card.get("sensing_radius", np.inf)))
+    return nearest(now, place, slots, float(card.get("sensing_radius") or np.inf))

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.rows import Rows
@@ -406,12 +406,12 @@ def _nearest_of_many(rows: np.ndarray, place: np.ndarray, k: int, sensing_radius
     axis that is too short to matter tells them apart, so that a tree of them is none of one leaf."""
     apart = NOWHERE * np.arange(len(rows)) / len(rows)
     places = np.column_stack([place - place.mean(0), apart])
-    tree = cKDTree(places)
+    tree = KDTree(places)
     found = np.full((len(rows), min(k, len(rows) - 1)), -1)
     size = max(CHUNK // (k + 1), 1)
     for start in range(0, len(rows), size):
-        near = tree.query(
-            places[start : start + size], found.shape[1] + 1, distance_upper_bound=np.nextafter(sensing_radius, np.inf)
-        )[1][:, 1:]  # oneself is the first
+        some, most = places[start : start + size], np.nextafter(sensing_radius, np.inf)
+        _, near = tree.query(some, found.shape[1] + 1, distance_upper_bound=most)
+        near = np.asarray(near)[:, 1:]  # oneself is the first
         found[start : start + size] = np.append(rows, -1)[near]
     return found
