@@ -45,6 +45,7 @@ def test_a_log_on_a_full_disk_is_given_back(at, tmp_path, monkeypatch):
         disk.setattr(os, "write", full)
         with pytest.raises(UserError, match="free some space"):
             begun.close() if begun else Evidence(tmp_path / "run.log", None, 2, None)
+    assert (tmp_path / "run.log").exists() == bool(begun), "without a record nothing is left"
     Evidence(tmp_path / "run.log", None, 2, None).close()
     assert check(tmp_path / "run.log").ended
 
@@ -134,6 +135,14 @@ def test_a_chain_that_no_controller_wrote_is_refused(record, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["log", "show", str(log.path)])
     assert stop.value.code == 2 and "record 1 is none of a controller" in " ".join(capsys.readouterr().err.split())
+
+
+def test_words_of_a_log_are_on_the_line_of_their_record(tmp_path, capsys):
+    log = ChainedLog(tmp_path / "forged")
+    log.add({"kind": "refused", "t": 0.0, "why": "late\n     1  1970-01-01T00:00:01.000  end"})
+    log.close()
+    main(["log", "show", str(log.path)])
+    assert len(capsys.readouterr().out.splitlines()) == 2
 
 
 def test_deep_nesting_is_refused(tmp_path):

@@ -321,6 +321,7 @@ def test_a_file_of_a_data_set_is_a_table_of_named_lists(tmp_path):
         ({"features": 3}, (), "no info.json that LeRobot writes"),
         ({"features": {}}, (), "column of the data set 'observation.state'"),
         ({}, ("left_", "left_"), "names one twice"),
+        ({}, [5], "arms is a int; give prefixes"),
         ({}, ("left_",), "The action 'right_waist' begins with none of left_"),
         ({}, ("left_", "right_waist", "right_e", "right_g"), "arms need the same entries"),
     ],
@@ -329,6 +330,43 @@ def test_data_sets_that_cannot_be_are_refused(tmp_path, changed, arms, said):
     lerobot(tmp_path / "set", **changed)
     with pytest.raises(UserError, match=said):
         read_lerobot(tmp_path / "set", arms)
+
+
+def rewritten(folder, **columns):
+    """The data set of `lerobot` with other columns, which meta/info.json names, too."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    lerobot(folder)
+    file, info = folder / "data" / "chunk-000" / "file-000.parquet", folder / "meta" / "info.json"
+    table, said = parquet.read_table(file), json.loads(info.read_text())
+    for name, column in columns.items():
+        table = (table.drop([name]) if name in table.column_names else table).append_column(name, pa.array(column))
+        said["features"][name] = {"dtype": "float32", "shape": [1]}
+    parquet.write_table(table, file)
+    info.write_text(json.dumps(said))
+    return folder
+
+
+def test_an_end_inside_of_a_lerobot_episode_cuts_it(tmp_path):
+    whole = read_lerobot(rewritten(tmp_path / "whole", **{"next.done": np.isin(np.arange(21), [11, 20])}))
+    one = read_lerobot(rewritten(tmp_path / "set", **{"next.done": np.isin(np.arange(21), [4, 11, 20])}))
+    assert not whole.notes and one.notes == ("next.done is set inside of episodes, which are cut there: 1 times",)
+    assert np.flatnonzero(np.diff(one.columns["episode"][:21])).tolist() == [4, 11]
+    np.testing.assert_array_equal(one.columns["reward"][[4, 5, 6]], [3, 0, 5])  # the last frame's leads nowhere
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"frame_index": 1000 * np.r_[0:12, 0:9]}, "frame_index goes up by 1000 from row to row"),
+        ({"next.reward": [[1.0, 2.0]] * 21}, "next.reward holds lists of 2 entries"),
+        ({"next.done": ["yes"] * 21}, "next.done is 'yes', no number"),
+    ],
+)
+def test_columns_of_data_sets_that_contradict_the_format_are_refused(tmp_path, columns, said):
+    with pytest.raises(UserError, match=said):
+        read_lerobot(rewritten(tmp_path / "set", **columns))
 
 
 def test_folders_that_are_no_data_sets_are_refused(tmp_path):
@@ -675,6 +713,12 @@ def test_names_that_hold_no_unit_are_left_alone():
         ("11/13/2015 23:59:{:02d}", "time_format", "%m/%d/%Y %H:%M:%S"),
         ("13.11.2015 23:59:{:02d}.5", "time_format", "%d.%m.%Y %H:%M:%S.%f"),
         ("10:00:{:02d}", "time_format", "%H:%M:%S"),
+        ("25/03/2024 11:59:{:02d} PM", "time_format", "%d/%m/%Y %I:%M:%S %p"),
+        ("25/03/24 23:59:{:02d}", "time_format", "%d/%m/%y %H:%M:%S"),
+        ("25/03/2024, 23:59:{:02d}", "time_format", "%d/%m/%Y, %H:%M:%S"),
+        ("25/03/2024T23:59:{:02d}Z", "time_format", "%d/%m/%YT%H:%M:%S%z"),
+        ("25-Mar-2024 23:59:{:02d}", "time_format", "%d-%b-%Y %H:%M:%S"),
+        ("Mon Mar 25 23:59:{:02d} 2024", "time_format", "%a %b %d %H:%M:%S %Y"),
         ("1{:02d},5", "decimal", ","),
     ],
 )
@@ -685,6 +729,16 @@ def test_what_is_no_number_is_told_how_to_be_one(tmp_path, entry, option, wanted
         EpisodeStore.from_table(file, **ALONE)
     store = EpisodeStore.from_table(file, **ALONE, **{option: wanted})
     assert store.card.dt == 1.0 and store.steps == 19
+
+
+@pytest.mark.parametrize("kind", [np.int64, float, str])
+def test_dates_of_digits_alone_are_no_seconds(kind):
+    """As seconds they would jump at every minute."""
+    times = np.array([20240325235950 + k for k in range(10)] + [20240326000000 + k for k in range(10)])
+    table = {"t": times.astype(kind), "id": np.zeros(20), "x": np.arange(20.0), "y": np.zeros(20)}
+    with pytest.raises(StoreError, match=r"row 0: t is .*20240325235950.*, .*time_format='%Y%m%d%H%M%S'"):
+        EpisodeStore.from_table(table, **ALONE)
+    assert EpisodeStore.from_table(table, **ALONE, time_format="%Y%m%d%H%M%S").steps == 19
 
 
 def test_rows_are_sorted_where_that_is_asked_for(tmp_path):

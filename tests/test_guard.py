@@ -487,6 +487,6 @@ def test_a_controller_may_decide_for_some_of_a_team(small_world, small_store):
     pilot = Controller(still, driven=1, **strict)
     np.testing.assert_array_equal(np.abs(pilot.act(seen, state)).max(1) > 1e-3, [False, True, False])
     assert pilot.info["clearance"] == pilot.info["agent_clearance"][1]
-    for wrong in (3, [0, -1], 1.0, []):
+    for wrong in (3, [0, -1], 1.0, [], [[0], [1, 2]]):
         with pytest.raises(UserError, match="must be agents, from 0 to 2"):
             Controller(still, driven=wrong, **strict)

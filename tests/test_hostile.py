@@ -24,19 +24,21 @@ from safetensors.numpy import save_file
 import ringfence
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
+from ringfence.datasets import importers
 from ringfence.datasets.audit import audit
 from ringfence.deploy.controller import Controller
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import StoreError, UserError
 from ringfence.evaluation import recordings
-from ringfence.evaluation.certificate import Certificate
+from ringfence.evaluation.certificate import Certificate, Monitor
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
 from ringfence.loading.resolve import load
+from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
-from ringfence.problem.constraints import Separation, SpeedLimit
-from ringfence.report import board
+from ringfence.problem.constraints import All, Separation, SpeedLimit
+from ringfence.report import board, build_report
 from ringfence.report.table import normal_return, sections
 from ringfence.training.runs import Run
 from tests import corpus, strange, strange_files
@@ -358,6 +360,7 @@ def test_ctrl_c_ends_what_does_not_hear_it_and_leaves_nothing_half_written(withi
         begun = time.monotonic()
         said = asked.communicate(timeout=60)[1]
     assert asked.returncode == 130 and "interrupted" in said and "Traceback" not in said
+    assert "checkpoint" not in said, "that command keeps none"
     assert seconds[0] <= time.monotonic() - begun < seconds[1] and not list(tmp_path.iterdir())
 
 
@@ -686,6 +689,9 @@ def test_files_of_strangers(tmp_path, in_time):
     parquet.write_table(pa.table(row_table(hit=times)), tmp_path / "a.parquet")
     with pytest.raises(UserError):
         tabled(tmp_path / "a.parquet")
+    file.write_text(",".join(map(str, range(60_000))) + "\n")
+    with pytest.raises(UserError, match="more than 50,000 columns; leave out"):
+        tabled(file)
     runs = pa.table({name: np.zeros(20_000_000, np.float32) for name in ("t", "id", "x", "y", "hit")})
     parquet.write_table(runs, tmp_path / "runs.parquet")
     del runs
@@ -741,6 +747,18 @@ def test_some_of_what_is_tried_by_the_thousand(kind, tmp_path):
         ({"terminations": {"a": 0.5, "b": False}}, "neither true nor false"),
         ({"infos": {"a": -1.0}}, "gave a the info '-1.0'; infos are a dict of each agent"),
         ({"step": np.array(1.0)}, "returned 1 things"),
+        (
+            {"observations": dict.fromkeys("ab", np.ones(2))},
+            "has shape .2, 2., Simulator, as it began, takes .2, 3.; show",
+        ),
+        (
+            {"observations": dict.fromkeys("ab", np.ones(4))},
+            "has shape .2, 4., Simulator, as it began, takes .2, 3.; show",
+        ),
+        *(
+            ({"infos": dict.fromkeys("ab", {"cost": {name: 1.0}})}, "name at most 100, each without slashes")
+            for name in ("", "a/b", "\x1b[2J", "\ud800", "x" * 121)
+        ),
     ],
 )
 def test_answers_of_simulators_that_are_none(odd, said):
@@ -818,12 +836,19 @@ def test_fields_of_importers_files(name, tmp_path):
 
 @pytest.mark.parametrize(
     ("agents", "options", "said"),
-    [(1000, {}, ""), (3000, {}, "1.1 GiB; let agents see fewer others, .* neighbours"), (3000, {"neighbours": 6}, "")],
+    [
+        (1000, {}, ""),
+        (3000, {}, "1.1 GiB; let agents see fewer others, .* neighbours"),
+        (3000, {"neighbours": 6}, ""),
+        (30_000, {}, "GiB; let agents see fewer others"),
+        (30_000, {"terminated": "end"}, "No 30000 agents are together for 5 steps"),
+        (30_000, {"neighbours": 2}, ""),
+    ],
 )
 def test_a_small_table_takes_no_large_memory(agents, options, said):
     """Of everybody's observations of everybody else, which are refused where there are too many."""
     who, step = np.divmod(np.arange(8 * agents), 8)
-    table = {"t": 0.1 * step, "id": who, "x": 1.0 * who, "y": 1.0 * step}
+    table = {"t": 0.1 * step, "id": who, "x": 1.0 * who, "y": 1.0 * step, "end": step % 2}
     tracemalloc.start()
     try:
         EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], **options)
@@ -881,6 +906,14 @@ def test_metrics_and_constants_of_strangers(trained_run, tmp_path):
         load(run)
 
 
+def test_nothing_is_added_that_makes_a_file_unreadable(trained_run, tmp_path):
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "run"))
+    before = run.results
+    with pytest.raises(UserError, match="could not be read again .*nothing was added"):
+        run.add_result("default", {"constraints": {"\ud800": {}}})
+    assert run.results == before
+
+
 THINGS = [3, None, [], {}, b"x", len, np.zeros(3)]
 
 
@@ -898,6 +931,16 @@ def test_things_of_other_kinds_are_refused_by_name(value, tmp_path):
         lambda: ringfence.train(value, store),
         lambda: store.followed_by(value),
         lambda: EpisodeStore.from_layout(table, value),
+        lambda: build_report(value, tmp_path / "a.html"),
+        lambda: importers.import_hdf5(value),
+        lambda: importers.import_omar(value),
+        lambda: importers.import_vault(value, "ant_2x4"),
+        lambda: read_lerobot(value),
+        lambda: All((value,)),
+        lambda: Monitor(value),
+        lambda: ringfence.collect(value, episodes=1),
+        lambda: observe({"observation_names": ["own.x"], "agents": 3}, {"x": [1.0]}),
+        lambda: observe({"observation_names": [value]}, {"x": [1.0]}),
     ]
     if value not in (None, {}) if not isinstance(value, np.ndarray) else True:
         asked.append(lambda: EpisodeStore.from_table(table, **how, card=value))
@@ -916,6 +959,7 @@ def test_things_of_other_kinds_are_refused_beside_a_run(value, trained_run, tmp_
     store, simulator, run = corpus.small_store(), SimpleSpreadParallel, trained_run
     asked = {
         **{name: lambda name=name: Controller(run, **{name: value}) for name in ("guard", "planner", "certificate")},
+        "array": lambda: Controller(run, guard=np.zeros(3)),
         "world": lambda: Controller(run, guard="shield", world=value),
         "Certificate": lambda: Certificate.load(value),
         "Run": lambda: Run(value),
@@ -962,8 +1006,10 @@ def test_names_that_are_missing_are_no_agents():
     times = np.array(["NaT", "2020-01-01"], "datetime64[s]")
     with pytest.raises(UserError, match="row 0: id is missing"):
         strange.tabled(strange.columns(id=np.repeat(times, 20)))
-    for days in ("datetime64[Y]", "datetime64[M]"):
-        with pytest.raises(UserError, match="counts years or months"):
+    with pytest.raises(UserError, match=r"id has shape \(40, 1\); give one entry per row"):
+        strange.tabled(strange.columns(id=np.repeat([[0], [1]], 20, 0)))
+    for days in ("datetime64[Y]", "datetime64[M]", "datetime64[as]"):
+        with pytest.raises(UserError, match="counts (years or months|attoseconds)"):
             strange.tabled(strange.columns(t=np.tile(np.arange(20), 2).astype(days)))
     with pytest.raises(UserError, match="row 0: t is"):
         strange.tabled(strange.columns(t=np.tile([f"0001-01-01T00:00:{k:02d}+14:00" for k in range(20)], 2)))

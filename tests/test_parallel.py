@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import os
 import shutil
 import warnings
 
@@ -193,6 +194,14 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         play(run, lambda: shared, episodes=2)
     with pytest.raises(UserError, match="SimpleSpreadParallel and not what makes one; give SimpleSpreadParallel"):
         play(run, shared)
+    for wrong, said in (
+        (5, "give the class, or a function, of a simulator"),
+        (os.system, "'command'.; give a function without"),
+    ):
+        with pytest.raises(UserError, match=said):
+            play(run, wrong)
+    with pytest.raises(UserError, match="system makes no simulator by itself"):
+        simulator("os:system")
     with pytest.raises(UserError, match="still is a function and no run; give ringfence.guard"):
         play(still, SimpleSpreadParallel)
     with pytest.raises(UserError, match="episodes=0 must be a whole number from 1"):

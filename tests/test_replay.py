@@ -221,6 +221,9 @@ def test_what_cannot_be_replayed_is_refused_in_a_sentence():
         ringfence.replay(None, store, radius=RADIUS)
     with pytest.raises(UserError, match="kinematics='rocket'"):
         ringfence.replay(None, store, radius=RADIUS, guard="none", kinematics="rocket")
+    for wrong in ({"wheelbase": -1}, {"wheelbase": np.inf}, {"radius": "a"}, {"radius": True}):
+        with pytest.raises(UserError, match="must be a number of metres above 0"):
+            ringfence.replay(None, store, guard="none", **wrong)
     slow = dataclasses.replace(store, card=store.card.updated(dt=10.0))
     with pytest.raises(UserError, match=r"A step of .* is 10 s, and a window has 8 s; .* \(--steps, steps=\)"):
         ringfence.replay(None, slow, radius=RADIUS, guard="none")

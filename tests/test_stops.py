@@ -173,12 +173,19 @@ def test_a_car_that_brakes_at_rest_stays(tmp_path):
     assert again.dynamics.stops == made.dynamics.stops == again.card.data.stops
 
 
-@pytest.mark.parametrize("wrong", [Stop("own.v", 0.0, 1.0), Stop(SPEED, None, 1.0, 9), Stop(SPEED, 1.0), Stop(AHEAD)])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *(Stop("own.v", 0.0, 1.0), Stop(SPEED, None, 1.0, 9), Stop(SPEED, 1.0), Stop(AHEAD)),
+        *(Stop("own.x", 5.0, -5.0), Stop("own.x", -1e308), Stop("own.x"), Stop(SPEED, None, -1.0), Stop(AHEAD, 1.0)),
+    ],
+)
 def test_a_file_with_stops_of_somebody_else_is_refused(wrong, small_world, tmp_path):
+    assert Stop(small_world.map.names[0], -5.0, 5.0).fits(small_world.map)
     data = msgspec.structs.replace(small_world.card.data, stops=(wrong,))
     card = msgspec.structs.replace(small_world.card, data=data)
     file = save(dataclasses.replace(small_world, card=card), tmp_path / "w.safetensors")
-    with pytest.raises(UserError, match="has stops of agents or entries that it does not know; fit it again"):
+    with pytest.raises(UserError, match="has stops of agents or entries that it does not know, or where no log ends"):
         load(file)
 
 

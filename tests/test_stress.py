@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 from scipy.stats import beta
@@ -35,11 +36,12 @@ from ringfence.faults import Faults
 from ringfence.faults.policy import Faulty, under_faults
 from ringfence.guards.options import GuardOptions
 from ringfence.guards.policy import build
-from ringfence.guards.wrap import Nothing
+from ringfence.guards.wrap import Nothing, guarded_of
 from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run, add_entry
 from ringfence.types import PolicyStep
+from ringfence.utils import schemas
 from ringfence.utils.chained import records
 from ringfence.utils.precision import full_products
 
@@ -491,8 +493,8 @@ def _promised(**changes):
         "replayed": None,
         "simulator": "",
         "format": 2,
-        "says": ["It is safe."],
-    } | changes
+    }
+    found |= {"says": list(schemas.check(found, Certificate).summary())} | changes
     words = json.dumps(found, sort_keys=True)
     return found | {"digest": hashlib.blake2b(words.encode(), digest_size=16).hexdigest()}
 
@@ -525,6 +527,8 @@ def test_a_certificate_is_believed_only_where_its_counts_say_so(tmp_path):
         ({"replayed": {"seconds": 1.0}}, "missing required field"),
         ({"format": 1}, "format 1"),
         ({"held": 2.0}, "<= 1.0"),
+        ({"says": ["It is safe."]}, "says another thing than its own counts"),
+        ({"safe": True}, "holds safe, which no certificate has"),
     ):
         file.write_text(json.dumps(_promised(**changes)))
         with pytest.raises(UserError, match=words):
@@ -576,7 +580,7 @@ def test_a_kept_promise_seldom_raises_an_alarm_and_a_broken_one_soon():
     assert np.isfinite(kept).mean() <= 0.02  # 1 % is promised, of all episodes to come
     assert np.median([first_alarm(0.6, 50) for _ in range(200)]) <= 5
     assert np.isfinite([first_alarm(0.1, 600) for _ in range(50)]).mean() > 0.9, "little is found out, too"
-    for wrong in ({"rate": 0.0}, {"rate": 0.1, "false_alarms": 1.0}, {"rate": float("nan")}):
+    for wrong in ({"rate": 0.0}, {"rate": 0.1, "false_alarms": 1.0}, {"rate": float("nan")}, {"rate": "a"}):
         with pytest.raises(UserError, match="must lie between 0 and 1"):
             Monitor(**wrong)
     with pytest.raises(UserError, match="must be true or false"):
@@ -637,6 +641,8 @@ def test_what_is_done_on_an_alarm_is_an_option(run, tmp_path):
         ({"on_alarm": "panic"}, "is none of its choices"),
         ({"on_alarm": "hand_over"}, "go together"),
         ({"fallback": print}, "go together"),
+        ({"on_alarm": "hand_over", "fallback": 5}, "fallback is a int; give a function"),
+        ({"clock": 5}, "clock is a int; give a function"),
     ):
         with pytest.raises(UserError, match=words):
             Controller(run, certificate=file, **wrong, **how)
@@ -704,5 +710,13 @@ def test_ages_follow_from_times_and_clocks_that_run_backwards_are_refused(run):
         controller.act(seen, observed_at=1.0)
     controller.reset()
     controller.act(seen, observed_at=1.0)
-    with pytest.raises(UserError, match="observed_at needs a World"):
+    with pytest.raises(UserError, match="observed_at needs a guard whose World"):
         Controller(run).act(seen, observed_at=0.0)
+    for agents in (5, "ab", {}):
+        with pytest.raises(UserError, match="agents=.* must be a list of names"):
+            controller.act(seen, agents=agents)
+    world = guarded_of(controller.policy).guard.world
+    card = msgspec.structs.replace(world.card, data=msgspec.structs.replace(world.card.data, dt=0.1))
+    unnamed = dataclasses.replace(world, card=card, map=dataclasses.replace(world.map, dt=None))  # how it moves
+    by_card = Controller(run, guard="shield", world=unnamed, max_age=3, clock=lambda: now[0], **LIGHT)
+    assert by_card.act(seen, observed_at=now[0]).shape == (8, 2)

@@ -151,7 +151,7 @@ def test_long_windows_are_cut_and_short_ones_left_out():
     assert cut(np.array([11, 3]), 1, None)[1].tolist() == [11, 3]
 
 
-def test_neighbours_are_those_who_are_nearest_at_that_time():
+def test_neighbours_are_those_who_are_nearest_at_that_time(monkeypatch):
     rng = np.random.default_rng(3)
     there = rng.random((2, 15, 6)) < 0.7
     there[:, :, 0] = True
@@ -167,6 +167,17 @@ def test_neighbours_are_those_who_are_nearest_at_that_time():
         far = np.linalg.norm(tracks.state - tracks.state[row], axis=1)
         wanted = [k for k in np.flatnonzero(same)[np.argsort(far[same])] if far[k] <= 2.0][:3]
         assert got[row].tolist() == wanted + [-1] * (3 - len(wanted))
+    monkeypatch.setattr("ringfence.logs.io.tracks.CHUNK", 9)  # so that moments of four are of many
+    np.testing.assert_array_equal(nearest(tracks, tracks.state, 3, 2.0), got)
+
+
+def test_crowds_at_one_place_have_neighbours():
+    """Their tree is none of one leaf, in which everybody looks at everybody."""
+    many, zeros = 2500, np.zeros(2500)
+    who = np.arange(many)
+    tracks = resample(0 * who, who, zeros, zeros[:, None], zeros[:, None], zeros, zeros[:, None], zeros > 0, 1.0, 9.0)
+    got = nearest(tracks, tracks.state, 2, 1.0)
+    assert (np.abs(got - who[:, None]) <= 2).all() and (got != who[:, None]).all() and (got >= 0).all()
 
 
 def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
@@ -267,6 +278,11 @@ def broken(**columns):
         (broken(run=(4, 3)) | {"id": np.array([None, *fleet()["id"][1:]], object)}, {}, "row 0: id is missing"),
         (fleet(), {"action_low": 0.0}, "action_low is said by the card, not by the table; give card={'action_low'"),
         (fleet(), {"dt": 0.0}, "dt=0.0 must be a number above 0"),
+        (
+            fleet() | {"end": np.arange(len(fleet()["t"])) % 2},
+            {"terminated": "end", "sort": True},
+            "ends an .* every row",
+        ),
         (fleet(), {"goal": ["gx"]}, "goal names 1 columns, the position has 2"),
         (fleet(), {"danger": CostColumn(), "cost": None}, "danger=CostColumn is not read from a table"),
         (fleet(), {"state": ["vx", "vy"], "danger": Separation(1.0), "cost": None}, "state holds no x, y or z"),
@@ -281,6 +297,12 @@ def broken(**columns):
 def test_tables_that_cannot_be_are_refused(table, options, said):
     with pytest.raises(UserError, match=said):
         EpisodeStore.from_table(table, **NAMES | options)
+
+
+def test_steps_that_a_large_table_has_too_few_rows_for_are_refused():
+    rows = np.arange(20_000.0)
+    with pytest.raises(UserError, match=r"Steps of 0.005 s would be 4e\+06 for 20,000 rows; give a larger dt"):
+        EpisodeStore.from_table({"t": rows, "id": 0 * rows, "x": rows}, time="t", agent="id", state=["x"], dt=0.005)
 
 
 def test_files_that_are_no_tables_are_refused(tmp_path):

@@ -7,6 +7,7 @@ import operator
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +16,7 @@ LAST_SEED = 2**31 - 1  # that JAX takes everywhere
 LONGEST = 4000  # letters of a message
 SHOWN = 100  # names that a refusal lists
 LONG = 60  # letters of each of them
+FARTHEST = 1e30  # of numbers that count anything
 
 
 class UserError(ValueError):
@@ -91,6 +93,14 @@ def whole_number(name: str, value, low: int = 0, high: int = 10**9) -> int:
     if isinstance(value, bool) or number is None or not low <= number <= high:
         raise UserError(f"{name}={str(value)[:60]} must be a whole number from {low:,} to {high:,}.")
     return number
+
+
+def above_zero(name: str, value: Any, unit: str) -> float:
+    """A finite number that somebody gave, above 0; anything else is refused by its name."""
+    number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else 0
+    if not 0 < number < FARTHEST:
+        raise UserError(f"{name}={value!r:.60} must be a number of {unit} above 0.")
+    return float(number)
 
 
 def of_kind(name: str, value: Any, kind: Any, remedy: str) -> None:

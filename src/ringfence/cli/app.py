@@ -606,6 +606,8 @@ COMMANDS = {
 }
 
 
+KEEPING = (["train"], ["fit"], ["bench"], ["demo"])  # those that keep what is finished
+
 GROUPS: dict[str, tuple[dict[str, Any], str]] = {
     "data": (data_commands.COMMANDS, "Episode stores: make, import, inspect."),
     "log": (log_commands.COMMANDS, "Look into a log that Controller(log=) wrote."),
@@ -630,10 +632,10 @@ def main(arguments: list[str] | None = None) -> None:
         )
         interrupts.check()  # a library may have swallowed it
     except KeyboardInterrupt as stopped:
-        _say_interrupted(str(stopped))
+        _say_interrupted(arguments, str(stopped))
     except Exception as error:
         if interrupts.asked():  # a library may have made another error of it
-            _say_interrupted()
+            _say_interrupted(arguments)
         sys.exit(_say_refused(error))
 
 
@@ -651,8 +653,9 @@ def _say_refused(error: Exception) -> int:
     return 2
 
 
-def _say_interrupted(said: str = "") -> NoReturn:
-    print(said or "interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+def _say_interrupted(arguments: list[str], said: str = "") -> NoReturn:
+    goes_on = "; the same command goes on from the last checkpoint" if arguments[:1] in KEEPING else ""
+    print(said or f"interrupted{goes_on}", file=sys.stderr)
     sys.exit(interrupts.STATUS)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from ringfence.cli.shared import console
-from ringfence.errors import whole_number
+from ringfence.errors import plain, whole_number
 from ringfence.utils.text import lines
 
 out = console()
@@ -65,7 +65,7 @@ def show(file: Positional[Path], first: int = 0, number: int = 20) -> None:
             counts[f"not {flag}"] += record.get(flag) is False
         if first <= record["n"] < first + number:
             for line in in_words(record):
-                out.print(lines(line), soft_wrap=True)
+                out.print(lines(plain(line)), soft_wrap=True)
     shown = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
     out.print(f"In all: {shown}.", soft_wrap=True)
 

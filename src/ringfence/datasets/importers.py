@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from ringfence.logs.schema import complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.utils import schemas
+from ringfence.utils.files import place
 
 SPREAD_TIER = re.compile(r"(?:simple_spread[-_])?(medium[-_]replay|medium|expert|random)")
 ROBOTS: dict[str, mujoco.Parts] = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
@@ -43,8 +44,9 @@ def import_omar(
     """
     if task is not None:
         complete_card({"task": task})  # a name that cannot be one is refused before the files are read
-    single = isinstance(directory, str | os.PathLike)
-    directories = [Path(directory)] if single else [Path(d) for d in directory]
+    single = isinstance(directory, str | os.PathLike) or not isinstance(directory, Iterable)
+    given: Any = [directory] if single else directory
+    directories = [place(d) for d in given]
     n = omar.check_alike(directories)
     task = _spread_task(directories, n, not single) if task is None else task
     known = _agents_of(task)
@@ -112,7 +114,7 @@ def import_vault(
     `speed_limit`: safety-gymnasium's (None), that of the tier's `-quantile` task ("quantile"), or any other (m/s).
     `tier`: a word for the data; the folder's name, where it is good, medium, poor, expert or replay.
     """
-    vault = Path(vault)
+    vault = place(vault)
     env, facts = _robot(task, _robot_tier(vault, tier), speed_limit)
     return _robots_store(ogmarl.read_vault(vault, env), facts)
 
@@ -122,7 +124,7 @@ def import_madiff(
 ) -> EpisodeStore:
     """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` and
     `tier` as of `import_vault`."""
-    directory = Path(directory)
+    directory = place(directory)
     env, facts = _robot(task, _robot_tier(directory, tier), speed_limit)
     return _robots_store(ogmarl.read_madiff(directory, env), facts)
 

@@ -84,7 +84,7 @@ class Controller:
         keep_programs()
         promised = None if certificate is None else Certificate.load(certificate)
         if promised is not None:
-            if options.get("guard", "none") == "none":
+            if str(options.get("guard", "none")) == "none":
                 raise UserError(UNGUARDED)
             brought = CALIBRATED if {*LOOKS, "horizon_seconds"} & set(options) else CALIBRATED + LOOKS
             options = {name: promised.guard[name] for name in brought if name in promised.guard} | options
@@ -185,7 +185,8 @@ class Controller:
                 if age is not None:
                     raise UserError("age and observed_at both say how old observations are; give one of them.")
                 guarded = guarded_of(self.policy)
-                dt = None if guarded is None else guarded.guard.world.map.dt
+                world = None if guarded is None else guarded.guard.world
+                dt = None if world is None else world.map.dt or world.card.data.dt
                 age = self._stamps.ages(observed_at, source.agents, dt)
             before = self._carry if age is None else self._aged(age)
             key, now = jax.random.split(self._key)
@@ -347,7 +348,10 @@ def _deciding_for(driven: int | Sequence[int], source: _TrainedRun | _Function) 
         raise UserError("driven says for whom a guard decides, and there is none; give guard=, or leave driven out.")
     if guarded.guard.world.alone:
         raise UserError("Here every agent guards itself, whoever acts; leave driven out, and act by its row alone.")
-    who = np.atleast_1d(np.asarray(driven))
+    try:
+        who = np.atleast_1d(np.asarray(driven))
+    except ValueError:  # lists of other lengths
+        who = np.zeros(0)
     if who.dtype.kind not in "iu" or who.ndim > 1 or not len(who) or not ((who >= 0) & (who < source.agents)).all():
         raise UserError(f"driven={driven!r} must be agents, from 0 to {source.agents - 1}.")
     acts = jnp.asarray(np.isin(np.arange(source.agents), who))[None]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import ringfence
-from ringfence.errors import UserError, known
+from ringfence.errors import UserError, known, of_kind
 from ringfence.evaluation.certificate import Certificate, Monitor, digest
 from ringfence.guards.wrap import Callback, guarded_of, with_guarded
 from ringfence.problem.homogeneous import agent_policy
@@ -162,6 +162,7 @@ class Watch:
 
     def __init__(self, certificate: Certificate | None, on_alarm: str, fallback: Fallback | None):
         known("on_alarm", on_alarm, ON_ALARM)
+        of_kind("fallback", fallback, Callable | None, "give a function of observations and state")
         if certificate is None and on_alarm != "report":
             raise UserError(f"on_alarm='{on_alarm}' is read by nothing without a certificate; give certificate=.")
         if (on_alarm == "hand_over") != (fallback is not None):
@@ -222,6 +223,7 @@ class Stamps:
     """Turns the times at which observations were made into ages in steps, and refuses clocks that run backwards."""
 
     def __init__(self, clock: Callable[[], float]):
+        of_kind("clock", clock, Callable, "give a function that tells the time in seconds")
         self._clock = clock
         self._last: np.ndarray | float = -np.inf
         self._now = -np.inf
@@ -236,7 +238,7 @@ class Stamps:
         now is given: deciding takes as long as it did lately."""
         if dt is None:
             raise UserError(
-                "observed_at needs a World that knows how long a step takes, and this one does not; give age= in steps."
+                "observed_at needs a guard whose World knows how long a step is (dt of its logs); give age= in steps."
             )
         stamps = np.asarray(observed_at)
         if stamps.dtype.kind not in "iuf" or stamps.shape not in ((), (agents,)) or not np.isfinite(stamps).all():

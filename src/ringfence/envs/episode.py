@@ -4,9 +4,10 @@ Simulators side by side are one `Env` (envs/base.py)."""
 
 from __future__ import annotations
 
+import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from ringfence.envs.base import Outcome, Seen
 from ringfence.errors import UserError, of_kind
 from ringfence.problem.origins import NOWHERE, Origins
+from ringfence.utils import schemas
 from ringfence.utils.given import NUMBERS, given_as, refuse_other_order
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
@@ -57,11 +59,27 @@ def check(env: Any, *names: str) -> None:
 
 def made(make_env: Callable[[], Any], *names: str) -> Any:
     """A simulator that has these besides; what makes none is refused."""
-    if not callable(make_env):
-        raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
+    check_maker(make_env)
     env = make_env()
     check(env, *names)
     return env
+
+
+def check_maker(make_env: Any) -> None:
+    """Refuse what makes no simulator: what cannot be called, or not without arguments."""
+    kind = getattr(make_env, "__name__", type(make_env).__name__)
+    if not callable(make_env):
+        own = f"{kind}, or lambda: {kind}(...)"
+        instead = own if hasattr(make_env, "step") else "the class, or a function, of a simulator"
+        raise UserError(f"make_env is a {kind} and not what makes one; give {instead}.")
+    try:
+        inspect.signature(make_env).bind()
+    except TypeError as error:
+        raise UserError(
+            f"{kind} makes no simulator by itself ({error}); give a function without arguments that makes one."
+        ) from None
+    except ValueError:  # of some that are written in C nobody knows
+        pass
 
 
 def is_vector(space: Any) -> bool:
@@ -114,6 +132,8 @@ class Episode:
             )
         self._check_count(begun[0])
         self._observe(begun[0])
+        states = shape.state if self.state is None else len(self.state)
+        self.shape = replace(shape, observation=self.seen.shape[1], state=states)  # of all that follows
 
     def _check_count(self, observations: ByAgent) -> None:
         """Refuse another number of agents; where they see something else, too, that is said first."""
@@ -226,6 +246,13 @@ class Episode:
 
     def _take_constraints(self, costs: Mapping[Any, Any]) -> None:
         """The step's cost by each constraint's name."""
+        try:
+            schemas.check({str(name): 0.0 for name in costs}, schemas.Limits)
+        except ValueError:
+            raise UserError(
+                f"Step {len(self.rewards)} of {self.name} tells costs of {str(list(costs))[:200]}; name at most 100, "
+                "each without slashes, line breaks or a leading dot or dash, of at most 120 letters."
+            ) from None
         self.constraints.append({str(k): self._of_agents(c, self.name) for k, c in costs.items()})
         names = list(self.constraints[0])
         now = list(self.constraints[-1])
@@ -285,7 +312,8 @@ class Episode:
     def _given(
         self, name: str, value: Any, shape: tuple[int | None, ...], origins: tuple[float, ...] | None
     ) -> np.ndarray:
-        return given_as(name, value, shape, origins=origins, double=self.shape.double)
+        begun = (f"{self.name}, as it began,", "show as many entries at every step") if self.rewards else ()
+        return given_as(name, value, shape, *begun, origins=origins, double=self.shape.double)
 
     def _refuse_without_state(self) -> None:
         if self.shape.needs_state:

@@ -16,6 +16,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -155,6 +156,10 @@ class Certificate:
             last = found.rounds[-1]
             if found.guard["margin"] != last["margin"] or found.agreed != (last["quantile"] <= last["margin"]):
                 raise ValueError(f"margin={found.guard['margin']} is not the one that its last batch was played with")
+            if unread := stored.keys() - {"says"} - fields_of(cls).keys():
+                raise ValueError(f"it holds {sorted(unread)[0]}, which no certificate has")
+            if stored.get("says") != list(found.summary()):
+                raise ValueError("it says another thing than its own counts")
         except (ValueError, OSError) as error:
             raise UserError(
                 f"'{path}' is no certificate ({str(error).rstrip('.')}); make one with `ringfence certify`."
@@ -197,8 +202,8 @@ class Monitor:
 
     def __init__(self, rate: float, false_alarms: float = 0.01):
         for name, value in (("rate", rate), ("false_alarms", false_alarms)):
-            if not 0 < value < 1:
-                raise UserError(f"{name}={value} must lie between 0 and 1.")
+            if not isinstance(value, Real) or not 0 < value < 1:
+                raise UserError(f"{name}={value!r:.60} must lie between 0 and 1.")
         self.rate = rate
         self.false_alarms = false_alarms
         self.episodes = 0

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from ringfence.envs.base import Moment, Watch, nobody, rollout, split_off
-from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, SideBySide
+from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, SideBySide, check_maker
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
 from ringfence.evaluation import protocol, recordings
 from ringfence.evaluation.compensation import compensated
@@ -234,9 +234,7 @@ def simulators_of(
     early_ends: str = "refuse",
 ) -> SideBySide:
     """So many simulators, each its own, in which the player can act."""
-    if not callable(make_env):
-        kind = type(make_env).__name__
-        raise UserError(f"make_env is a {kind} and not what makes one; give {kind}, or lambda: {kind}(...).")
+    check_maker(make_env)
     envs = [make_env() for _ in range(count)]
     if len({id(env) for env in envs}) < len(envs):
         raise UserError(
@@ -348,6 +346,7 @@ def simulator(name: str) -> NamedSimulator:
         raise UserError(
             f"'{where}' has no {attribute} that can be called; name the class, or the function, that makes one."
         )
+    check_maker(make)
     return NamedSimulator(name, make)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
-from ringfence.errors import LAST_SEED, UserError, known, of_kind, whole_number
+from ringfence.errors import LAST_SEED, UserError, above_zero, known, of_kind, whole_number
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.protocol import FORESEEN
 from ringfence.evaluation.replay_scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
@@ -89,7 +89,8 @@ def replay(
     """
     keep_programs()
     of_kind("store", store, EpisodeStore, "give an EpisodeStore")
-    _check(drivers, guard, windows, steps, seed)
+    _check(drivers, guard, windows, seed)
+    how = Body(kinematics, wheelbase, radius, steps, every_episode)
     run = None if policy is None else Run.of(policy)
     logs = Logs.of(store, run)
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
@@ -100,7 +101,6 @@ def replay(
     knowing = _knowing(run, logs.task, guard, given, anyway, faults) if compensate else given
     guarded = _guarded(run, logs.task, guard, knowing, anyway)
     known_world = given.get("world") if guarded is None else guarded.guard.world
-    how = Body(kinematics, wheelbase, radius, steps, every_episode)
     stage, source, left_out = logs.stage(known_world, how, windows, seed, faults)
     notes = _notes(logs, guarded, faults, compensate)
     filters = _filters(guard, guarded, known_world if baselines else None, stage, notes)
@@ -173,6 +173,13 @@ class Body:
     radius: float | None = None  # m
     steps: int | None = None
     every_episode: bool = False
+
+    def __post_init__(self):
+        above_zero("wheelbase", self.wheelbase, "metres")
+        if self.radius is not None:
+            above_zero("radius", self.radius, "metres")
+        if self.steps is not None:
+            whole_number("steps", self.steps, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,15 +285,13 @@ def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], a
     return build(Nothing(), spec.world, task.hazard, guard, spec.barrier, anyway=anyway, **changes)
 
 
-def _check(drivers: Sequence[str], guard: str, windows: int, steps: int | None, seed: int) -> None:
+def _check(drivers: Sequence[str], guard: str, windows: int, seed: int) -> None:
     of_kind("drivers", drivers, Sequence, "give a list of their names")
     for name in drivers:
         known("driver", name, DRIVERS)
     known("guard", guard, GUARDS)
     whole_number("windows", windows, 1)
     whole_number("seed", seed, 0, LAST_SEED)
-    if steps is not None:
-        whole_number("steps", steps, 1)
 
 
 def check_view(world: World, store: EpisodeStore) -> None:
@@ -349,9 +354,7 @@ def radius_of(
     """(m, where it is from): as given, the task's own, the distance that best tells the logged unsafe steps, or where
     danger of a distance begins among the causes of a World's card."""
     if given is not None:
-        if not 0 < given < np.inf:
-            raise UserError(f"radius={given!r} must be a number of metres above 0.")
-        return float(given), "given"
+        return above_zero("radius", given, "metres"), "given"
     hazard = store.hazard
     parts = hazard.hazards if isinstance(hazard, constraints.All) else (hazard,)
     radii = [part.radius for part in parts if isinstance(part, constraints.Separation)]

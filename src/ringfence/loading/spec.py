@@ -62,12 +62,12 @@ class PolicySpec:
         """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
         Unknown names are refused, and so is what nothing would read. `execution` is the guard's, and without one the
         planner's."""
+        _known("planner", planner, PLANNERS)
+        _known("guard", guard, GUARDS)
         guards = guard != "none" or any(f.name in options for f in dataclasses.fields(GuardOptions))
         if execution is not None and not guards:
             options["execution"] = execution
             execution = None
-        _known("planner", planner, PLANNERS)
-        _known("guard", guard, GUARDS)
         _known("execution", execution or "centralized", EXECUTIONS)
         if barrier is not None:
             _known("barrier", barrier, SOURCES)

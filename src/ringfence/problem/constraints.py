@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, SupportsFloat
 
@@ -71,7 +71,10 @@ class All:
     hazards: tuple[Hazard, ...]
 
     def __post_init__(self):
+        of_kind("hazards", self.hazards, Iterable, "give several hazards")
         object.__setattr__(self, "hazards", tuple(self.hazards))
+        for one in self.hazards:
+            of_kind("a hazard of All", one, Hazard, "give a Separation, SpeedLimit or CostColumn")
 
 
 Hazard = Separation | SpeedLimit | CostColumn | All

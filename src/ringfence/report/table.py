@@ -12,12 +12,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ringfence.algos import ALGORITHMS
-from ringfence.errors import UserError
+from ringfence.errors import UserError, of_kind
 from ringfence.evaluation import reference, statistics
 from ringfence.evaluation.statistics import Interval
 from ringfence.evaluation.table import SPLITS, Result, Row, check, of_reference, of_references, of_run
 from ringfence.training.runs import LOGS, Run, runs_below
 from ringfence.utils.config import fields_of
+from ringfence.utils.files import place
 
 NAMES = {
     "bc": "BC",
@@ -168,8 +169,9 @@ def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Sectio
     """One section per task of evaluated runs, in the order in which the runs name them."""
     rows: dict[str, list[Row]] = {}
     distinct: dict[Path, Run] = {}  # the same folder named twice counts once
+    of_kind("runs", runs, Iterable | Run | Path, "give run folders, or one of them")
     for each in [runs] if isinstance(runs, str | Path | Run) else runs:
-        below = [] if isinstance(each, Run) else runs_below(Path(each))
+        below = [] if isinstance(each, Run) else runs_below(place(each))
         for run in below or [Run.of(each)]:
             distinct.setdefault(run.path.resolve(), run)
     for run in distinct.values():

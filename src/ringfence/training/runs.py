@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from ringfence.errors import CheckpointError, UserError
+from ringfence.errors import CheckpointError, UserError, reason
 from ringfence.types import PyTree
 from ringfence.utils import schemas
 from ringfence.utils.files import alone, place, regular, whole
@@ -214,10 +214,13 @@ def add_entry(path: Path, read: Callable[[], dict[str, Any]], name: str, entry: 
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Whole or not at all; a number that is not finite, which nobody could read again, is refused by its name."""
+    """Whole or not at all; what nobody could read again is refused, a number that is not finite by its name."""
     try:
         content = json.dumps(data, indent=1, allow_nan=False)
-    except ValueError:
+        schemas.decode(content, Any)
+    except ValueError as error:
+        if not any(_not_finite(data)):
+            raise UserError(f"'{path}' could not be read again ({reason(error)}); nothing was added to it.") from None
         name = next(_not_finite(data), "something")
         raise UserError(f"'{path}' holds finite numbers alone, and {name} is none; nothing was added to it.") from None
     with whole(path) as temporary:

@@ -56,15 +56,17 @@ class ChainedLog:
 
     def __init__(self, path: str | Path):
         self.path = writable(path)
-        there = self.path.exists() and self.path.stat().st_size > 0
-        found = check(self.path) if there else Checked(0, BEFORE_ALL, True)
+        there = self.path.exists()
+        found = check(self.path) if there and self.path.stat().st_size > 0 else Checked(0, BEFORE_ALL, True)
         self.records = found.records
         self.last = found.last
         try:
             self._file: int | None = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         except OSError as error:
             raise UserError(f"'{path}' could not be written ({error.strerror}); choose another place.") from error
+        self._fresh = False
         self._own()
+        self._fresh = not there  # holds nothing of anybody's
         self._size = os.fstat(self._file).st_size  # bytes of whole records
 
     def _own(self) -> None:
@@ -115,8 +117,11 @@ class ChainedLog:
             self.close()  # nothing can be added any more; what stands there says so
 
     def close(self) -> None:
-        """Give the file back."""
+        """Give the file back; without a record nothing is left."""
         if self._file is not None:
+            if self._fresh and not self.records:
+                with suppress(OSError):
+                    self.path.unlink()
             with suppress(OSError):
                 os.close(self._file)
         self._file = None

@@ -91,7 +91,7 @@ def read_text(field: Field, text: str) -> Any:
 
 def refuse_out_of_bounds(field: Field, value: Any, of: str = "") -> None:
     """Refuse a number out of the field's bounds, one that is not finite, and none of a literal's values."""
-    if field.choices and value not in field.choices:
+    if field.choices and (not isinstance(value, str | int | float | None) or value not in field.choices):
         raise unknown(f"value of {of}'s {field.name}" if of else field.name, str(value), map(str, field.choices))
     if isinstance(value, bool) or not isinstance(value, int | float):
         return

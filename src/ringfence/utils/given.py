@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,8 @@ def given_as(
 def refuse_other_order(agents: Sequence[Any], known: Sequence[str] | None, all_known: bool = True) -> None:
     """Refuse agents whose rows would be taken for others': those that the logs know at another place, or, where they
     are `all_known`, not at all. Logs that name none are of nobody in particular."""
+    if isinstance(agents, str | bytes | Mapping) or not isinstance(agents, Iterable):
+        raise UserError(f"agents={str(agents)[:60]!r} must be a list of names, in the order of the rows.")
     if known is None:
         return
     for k, (agent, logged) in enumerate(itertools.zip_longest(map(str, agents), known)):

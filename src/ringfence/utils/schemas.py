@@ -78,6 +78,7 @@ class Data(TypedDict, total=False):
     state_names: list[str] | None
     observation_origins: list[float] | None
     state_origins: list[float] | None
+    sensing_radius: Annotated[float, msgspec.Meta(gt=0)] | None
 
 
 class Config(TypedDict):

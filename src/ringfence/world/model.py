@@ -169,7 +169,9 @@ def _read(path: Path, map: features.FeatureMap | None) -> World:
     if beyond is not None:
         raise UserError(f"'{path}' reads {beyond} in its logs; fit it again.")
     if not all(stop.fits(map) for stop in card.data.stops):
-        raise UserError(f"'{path}' has stops of agents or entries that it does not know; fit it again.")
+        raise UserError(
+            f"'{path}' has stops of agents or entries that it does not know, or where no log ends; fit it again."
+        )
     if map.plus.shape[0] != spec.n_agents:
         raise UserError(f"'{path}' is of {spec.n_agents} agents and sees {map.plus.shape[0]}; fit it again.")
     return as_tree(raw, blank_world(map, spec, settings, names, card), path)

@@ -27,6 +27,7 @@ SURELY = 3.0  # times what that law errs by
 ROUNDING = 4e-6  # of the value
 STEPS = 20_000  # that the law is of
 UNLIMITED = 1e9  # a speed
+LARGEST = 1e15  # as of arrays that a store takes
 
 
 class Stop(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -44,10 +45,16 @@ class Stop(msgspec.Struct, frozen=True, omit_defaults=True):
         return f"{self.name}{whose} at {' and '.join(ends)}"
 
     def fits(self, map: FeatureMap) -> bool:
-        """Whether it is of an agent and of a value that the view has."""
+        """Whether it is of an agent and of a value that the view has, and what logs can come to."""
+        ends = [end for end in (self.low, self.high) if end is not None]
+        if not ends or any(not abs(end) <= LARGEST for end in ends) or ends != sorted(ends):
+            return False
         known = self.agent is None or 0 <= self.agent < len(map.plus)
-        needed = {SPEED: self.high, AHEAD: self.low}
-        return known and (needed[self.name] is not None if self.name in needed else self.name in map.names)
+        if self.name == SPEED:
+            return known and self.high is not None and self.high >= 0
+        if self.name == AHEAD:
+            return known and self.low is not None and self.low <= 0
+        return known and self.name in map.names
 
 
 @dataclass(frozen=True)

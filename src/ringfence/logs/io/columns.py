@@ -27,8 +27,23 @@ LINES = (".jsonl", ".ndjson")
 PARQUET = (".parquet", ".pq")
 KINDS = (".csv", *PARQUET, *LINES, *READERS)
 LONGEST = 1000  # entries of a list
+WIDEST = 50_000  # columns of text, each of which takes kilobytes before its first row
 LINE = 40  # bytes of a row of text, about
 BLOCK = 2**24  # bytes of text that are read at once
+SHOWN = 40  # letters of an entry
+LOOKS = (  # parts of times, and how they are written
+    (r"^\d{14}$", "%Y%m%d%H%M%S"),
+    (r"(?<!\d)\d{1,2}:\d{2}:\d{2}\.\d{1,6}(?!\d)", "%H:%M:%S.%f"),
+    (r"(?<!\d)\d{1,2}:\d{2}:\d{2}", "%H:%M:%S"),
+    (r"(?<![\d:+-])\d{1,2}:\d{2}(?!\d)", "%H:%M"),
+    (r"\b[ap]m\b", "%p"),
+    (r"(?<=[SfMp ])([+-]\d{2}:?\d{2}|Z)$", "%z"),
+    (r"\b(UTC|GMT)\b", "%Z"),
+    (r"\b(Mon|Tues|Wednes|Thurs|Fri|Satur|Sun)day\b", "%A"),
+    (r"\b(Mon|Tue|Wed|Thu|Fri|Sat|Sun)\b", "%a"),
+    (r"\b(January|February|March|April|June|July|August|September|October|November|December)\b", "%B"),
+    (r"\b(Jan|Feb|Mar|Apr|May|Jun|Jul|Aug|Sep|Oct|Nov|Dec)\b", "%b"),
+)
 COMMA = re.compile(r"[+-]?(\d+(,\d*)?|,\d+)([eE][+-]?\d+)?")
 
 
@@ -93,16 +108,38 @@ def seconds(columns: Columns, name: str) -> np.ndarray:
     """A column of times as float64 s; dates are counted from the first of them."""
     column = columns[name]
     if column.dtype.kind not in "Mm":
-        return numbers(columns, name)
+        found = numbers(columns, name)
+        if _reads_as_dates(found):
+            raise StoreError(
+                f"row 0: {name} is {found[0]:.0f}, which reads as a date and no count of seconds; say how times are "
+                "written, as time_format='%Y%m%d%H%M%S' (--time-format)."
+            )
+        return found
     _refuse_missing(name, np.isnat(column))
-    if np.datetime_data(column.dtype)[0] in "YM":
+    if (unit := np.datetime_data(column.dtype)[0]) in ("Y", "M"):
         raise StoreError(f"{name} counts years or months, which are of several lengths; give dates of days or less.")
+    if unit == "as":
+        raise StoreError(f"{name} counts attoseconds, of which ten seconds are too many; give nanoseconds.")
     return (column - column.min() if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
+
+
+def _reads_as_dates(numbers: np.ndarray) -> bool:
+    """Whether all are fourteen digits of a year, month, day, hour, minute and second."""
+    finite = np.isfinite(numbers)
+    rest, fits = np.floor(np.where(finite, numbers, 0.0)), finite
+    for size, least, most in ((100, 0, 60), (100, 0, 59), (100, 0, 23), (100, 1, 31), (100, 1, 12), (1e5, 1900, 2100)):
+        fits = fits & (rest % size >= least) & (rest % size <= most)
+        rest = rest // size
+    return bool(fits.all() and not rest.any())
 
 
 def dates(name: str, column: np.ndarray, written: str | None = None) -> np.ndarray:
     """A column of dates that are `written` as text (by default as ISO 8601) as dates; one of no dates as it is. Those
     with an offset are counted in UTC, and a column in which some have one is left to be refused."""
+    if written is not None and (column.dtype.kind in "iu" or (column.dtype.kind == "f" and _reads_as_dates(column))):
+        column = (column.astype(np.int64) if column.dtype.kind == "f" else column).astype(
+            str
+        )  # as the text that a file's would be
     if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
         return column
     read = [_date(entry, written) for entry in column.tolist()]
@@ -137,18 +174,21 @@ def _remedy(entry: Any) -> str | None:
     text = f"{entry:%H:%M:%S}" if isinstance(entry, time) else str(entry).strip()
     if re.fullmatch(r"[+-]?\d+,\d+", text):
         return "if its comma is a decimal point, give decimal=',' (--decimal ,)"
-    date = re.match(r"(\d{1,4})([/.-])(\d{1,2})\2(\d{1,4})([T ]*)", text)
-    clock = re.fullmatch(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?", text[date.end() :] if date else text)
-    if not (date or clock):
-        return None
-    form = ""
-    if date:
-        first, mark, second, _, between = date.groups()
-        order = "Ymd" if len(first) == 4 else "mdY" if int(second) > 12 else "dmY"
-        form = mark.join(f"%{letter}" for letter in order) + between
-    if clock:
-        form += "%H:%M" + (":%S" if clock[1] else "") + (".%f" if clock[2] else "")
-    return f"if it is a time, say how times are written, as time_format='{form}' (--time-format)"
+    form = next((form for form in _forms(text[:SHOWN]) if _date(text, form) is not None), None)
+    return form and f"if it is a time, say how times are written, as time_format='{form}' (--time-format)"
+
+
+def _forms(text: str) -> Iterator[str]:
+    """How a time may be written that looks so, with the day before the month where both are possible."""
+    form = text.replace("%", "%%")
+    for looks, letters in LOOKS:
+        form = re.sub(looks, letters, form, flags=re.IGNORECASE)
+    if "%p" in form:
+        form = form.replace("%H", "%I")
+    pieces = re.split(r"\d+", form)
+    for order in ("", "dmY", "mdY", "Ymd", "dmy", "mdy", "ymd", "dY", "Yd", "dy"):
+        if len(order) == len(pieces) - 1 and (len(order) == 3 or "%" in form):
+            yield "".join(a + b for a, b in zip(pieces, [*(f"%{letter}" for letter in order), ""]))
 
 
 def numbers(columns: Columns, name: str) -> np.ndarray:
@@ -369,6 +409,8 @@ def _of_csv(
         lines = (line for line in file if line.strip() and not line.startswith("#"))
         head = next(lines, "") if form.header else file.readline(2**20)
         separator = max(",;\t|", key=head.count)  # the first of those that separate as often
+        if head.count(separator) >= WIDEST:
+            raise StoreError(f"'{path}' has more than {WIDEST:,} columns; leave out those that nobody needs.")
         source: Any = path
         if form.header:
             spaces = separator not in head

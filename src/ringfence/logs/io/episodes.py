@@ -84,9 +84,14 @@ class Entry(NamedTuple):
     column: np.ndarray  # (R,)
     whose: np.ndarray | None = None  # (N,) of which other agent of the window, by who sees it; None: of oneself
     relative: bool = False  # to oneself
+    near: np.ndarray | None = None  # (R,) the row of another agent, relative to oneself; −1 of nobody, who is `beyond`
+    beyond: float = 0.0
 
     def of(self, rows: np.ndarray) -> np.ndarray:
         """(..., N) in rows (..., N) of the tracks."""
+        if self.near is not None:
+            theirs = self.near[rows]
+            return np.where(theirs < 0, self.beyond, self.column[theirs] - self.column[rows])
         if self.whose is None:
             return self.column[rows]
         theirs = self.column[rows[..., self.whose]]
@@ -211,7 +216,8 @@ def _in_place(motion: Motion, rows: np.ndarray, there: np.ndarray) -> np.ndarray
         free = iter(sorted({*range(len(who))} - taken.keys()))
         taken |= {next(free): agent for agent in who if taken.get(place.get(agent, -1)) != agent}
         place |= {agent: column for column, agent in taken.items()}
-        order[window] = [who.index(taken[column]) for column in range(len(who))]
+        at = {agent: k for k, agent in enumerate(who)}
+        order[window] = [at[taken[column]] for column in range(len(who))]
         before = set(who)
     return np.take_along_axis(rows, np.repeat(order, there, 0), 1)
 
@@ -280,20 +286,23 @@ def neighbour_episodes(motion: Motion) -> Episodes:
         )
     own, axes = motion.own(with_place=False), (*schema.position, *schema.axes)
     _refuse_large(motion, len(index), len(own) + schema.neighbours * (1 + len(axes)))
-    near = nearest(tracks, motion.place, schema.neighbours, schema.sensing_radius or np.inf)
-    seen = near >= 0
-    offset = np.where(seen[..., None], motion.place[near] - motion.place[:, None], 0.0)
-    drift = np.where(seen[..., None], motion.velocity[near] - motion.velocity[:, None], 0.0)
-    radius = schema.sensing_radius or float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
-    offset[~seen] = np.eye(offset.shape[-1])[0] * radius  # nobody is as far as one sees
+    near = nearest(tracks, motion.place, schema.neighbours, schema.sensing_radius or np.inf).T
+    distance = np.full(len(tracks.step), np.inf)  # of the nearest
+    reach = 1.0
+    for whose in near[::-1]:
+        seen = whose >= 0
+        distance[seen] = np.linalg.norm(motion.place[whose[seen]] - motion.place[seen], axis=1)
+        reach = max(reach, float(distance[seen].max(initial=0.0)))
+    radius = schema.sensing_radius or reach
     entries = [*own]
-    for j in range(schema.neighbours):
-        entries += [Entry(f"other{j}.d{axis}", offset[:, j, k]) for k, axis in enumerate(schema.position)]
-        entries += [Entry(f"other{j}.dv{axis}", drift[:, j, k]) for k, axis in enumerate(schema.axes)]
-        entries.append(Entry(f"other{j}.seen", seen[:, j].astype(float)))
+    for j, whose in enumerate(near):  # nobody is as far as one sees
+        for k, axis in enumerate(schema.position):
+            entries.append(Entry(f"other{j}.d{axis}", motion.place[:, k], near=whose, beyond=0.0 if k else radius))
+        for k, axis in enumerate(schema.axes):
+            entries.append(Entry(f"other{j}.dv{axis}", motion.velocity[:, k], near=whose))
+        entries.append(Entry(f"other{j}.seen", whose >= 0))
     cost = tracks.cost
     if schema.separation is not None:
-        close = np.linalg.norm(offset[:, 0], axis=-1) < schema.separation.radius
-        cost = (close & seen[:, 0]).astype(float)[:, None]
+        cost = (distance < schema.separation.radius).astype(float)[:, None]
     rows = index[:, None]
     return Episodes(rows, lengths, entries, cost[rows], notes, float(radius))

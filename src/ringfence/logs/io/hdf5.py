@@ -39,6 +39,7 @@ from ringfence.errors import StoreError, reading, reason
 from ringfence.logs.io import common
 from ringfence.problem.bounds import Bounds
 from ringfence.utils import arrays, schemas
+from ringfence.utils.files import place
 
 D4RL = ("observations", "actions", "rewards", "terminals", "timeouts")
 DSRL = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
@@ -65,7 +66,7 @@ def read_hdf5(path: Path, asked: common.Asked) -> tuple[dict[str, Any], str]:
 # --- finding and recognising ---
 def located(given: str | os.PathLike) -> Path:
     """The HDF5 file of a path, of a Minari data set's folder, or of its name."""
-    path = Path(given)
+    path = place(given)
     if path.is_file():
         return path
     if path.is_dir():

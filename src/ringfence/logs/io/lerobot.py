@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError, one_of, reading
+from ringfence.errors import StoreError, UserError, of_kind, one_of, reading
 from ringfence.logs.io.columns import Columns, Table, by_entry, known, numbers, reader, stacked
 from ringfence.logs.io.formats import names_in, read_parquet
 from ringfence.utils import schemas
+from ringfence.utils.files import place
 from ringfence.utils.text import natural
 
 INFO = "meta/info.json"
@@ -27,6 +28,7 @@ SIDES = ("left", "right")  # arms, where every action begins with one of them
 STATE = "observation.state"
 ACTION = "action"
 REWARD = "next.reward"
+DONE = "next.done"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +48,14 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     """The table of a data set. `arms` are prefixes of entries' names: each is an agent, whose entries are called alike
     without it (`left_waist` and `right_waist`). By default `left` and `right`, where every action begins with one of
     them, else the robot is one agent. Entries of the state without such a prefix are every arm's."""
-    folder = Path(folder)
+    folder = place(folder)
     info = read_info(folder / INFO)
     wanted = [*state, ACTION]
     for name in wanted:
         one_of("column of the data set", name, info.names)
-    reward = [REWARD] if REWARD in info.names else []
-    read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward])
-    single = {name: next(iter(_entries(name, read[name], None).values())) for name in read if name not in wanted}
+    reward, done = ([name] if name in info.names else [] for name in (REWARD, DONE))
+    read = _read_files(folder, ["episode_index", "frame_index", *wanted, *reward, *done])
+    single = {name: _single(name, read[name]) for name in read if name not in wanted}
     own = {name: _entries(name, read[name], info.names[name]) for name in wanted}
     states = dict(own[state[0]]) if state else {}
     for name in state[1:]:  # entries of another column (`observation.velocity`) say whose they are
@@ -61,17 +63,26 @@ def read_lerobot(folder: str | Path, arms: Sequence[str] = (), state: Sequence[s
     actions = own[ACTION]
     agents = _agents(arms, list(actions))
     frames = len(read["frame_index"])
-    columns = {
-        "time": numbers(single, "frame_index") / info.fps,
-        "episode": single["episode_index"],
-    }
+    frame, episode = numbers(single, "frame_index"), single["episode_index"]
+    follows = episode[1:] == episode[:-1]
+    usual = float(np.median(np.diff(frame)[follows])) if follows.any() else 1.0
+    if usual != 1:
+        raise StoreError(
+            f"frame_index goes up by {usual:g} from row to row, and {INFO} counts {info.fps:g} frames a second; count "
+            "an episode's frames 0, 1, 2, … and say how many a second has."
+        )
+    over = follows & (numbers(single, DONE)[:-1] != 0) if done else np.zeros(len(follows), bool)
+    if over.any():
+        episode = np.append(0, np.cumsum(~follows | over))
+        follows &= ~over
+    columns = {"time": frame / info.fps, "episode": episode}
     if reward:  # what a frame's action earned, in the frame in which it arrived
         columns["reward"] = np.zeros(frames)
-        follows = single["episode_index"][1:] == single["episode_index"][:-1]
         columns["reward"][1:][follows] = numbers(single, REWARD)[:-1][follows]
     table, names = _by_agent(columns, agents, states, actions)
     missing = frames != info.frames
     notes = [f"{INFO} counts {info.frames} frames, {frames} are here"] if missing else []
+    notes += [f"{DONE} is set inside of episodes, which are cut there: {over.sum()} times"] if over.any() else []
     return LeRobotTable(table, *names, "reward" if reward else None, tuple(agents), 1 / info.fps, tuple(notes))
 
 
@@ -148,6 +159,14 @@ def _entries(name: str, column: np.ndarray, names: list[str] | None) -> Columns:
     return by_entry(name, column[:, None] if rows is None else rows, names)
 
 
+def _single(name: str, column: np.ndarray) -> np.ndarray:
+    """A column of numbers, or of lists of one."""
+    entries = list(_entries(name, column, None).values())
+    if len(entries) > 1:
+        raise StoreError(f"{name} holds lists of {len(entries)} entries, and one number is read; write one a frame.")
+    return entries[0]
+
+
 # --- agents ---
 def _agents(arms: Sequence[str], actions: list[str]) -> dict[str, str]:
     """Prefixes by agents' names; one agent has none."""
@@ -155,6 +174,8 @@ def _agents(arms: Sequence[str], actions: list[str]) -> dict[str, str]:
         sides = [side for side in SIDES if any(name.startswith(side) for name in actions)]
         whole = len(sides) == len(SIDES) and all(name.startswith(SIDES) for name in actions)
         return {side: side for side in sides} if whole else {"robot": ""}
+    for arm in arms:
+        of_kind("arms", arm, str, "give prefixes of entries' names, such as 'left_'")
     if len(set(arms)) < len(arms):
         raise UserError(f"arms={list(arms)} names one twice; name each once.")
     nobodys = [name for name in actions if not name.startswith(tuple(arms))]

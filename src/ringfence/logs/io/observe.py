@@ -14,6 +14,7 @@ from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import SPACE, Entries, Entry
 from ringfence.problem.partners import others
+from ringfence.utils import schemas
 from ringfence.utils.given import given_as, refuse_other_order
 
 
@@ -34,6 +35,10 @@ def observe(
     of_kind("state", state, Mapping, "give a dictionary of columns, with one number of each agent")
     of_kind("goal", goal, Mapping | None, "give a dictionary of columns, with one number of each agent")
     fields = card.to_dict() if isinstance(card, StoreCard) else card
+    try:
+        schemas.check(dict(fields), schemas.Data)
+    except ValueError as error:
+        raise UserError(f"card is none of a store ({error}); give that of one which from_table made.") from None
     names: list[str] = list(fields.get("observation_names") or ())
     if not names:
         raise UserError("card names no observations; give that of a store which from_table made.")
@@ -50,7 +55,7 @@ def observe(
     known = {e.source: e for e in Entries.of(names).each}
     places = 1 + max((e.order for e in known.values() if e.whose == "other" and e.order is not None), default=-1)
     whom = _seen_by_each(fields, columns, places)
-    now = _Now(columns, goals, whom, float(fields.get("sensing_radius", np.inf)))
+    now = _Now(columns, goals, whom, float(fields.get("sensing_radius") or np.inf))
     seen = np.stack([now.entry(name, known.get(d)) for d, name in enumerate(names)], 1)
     return seen if fields.get("observation_origins") else seen.astype(np.float32)
 
@@ -105,4 +110,4 @@ def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots
     zero = np.zeros(n, int)
     place = np.stack([columns[axis] for axis in SPACE if axis in columns], 1)
     now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, zero > 0, card.get("dt", 1.0))
-    return nearest(now, place, slots, float(card.get("sensing_radius", np.inf)))
+    return nearest(now, place, slots, float(card.get("sensing_radius") or np.inf))

@@ -17,6 +17,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.bagfile import ROLES, SHOWN, BagFile, Topic, joined, opened, topic_name
+from ringfence.utils.files import place
 from ringfence.utils.text import natural
 
 TWIST = ("vx", "vy", "wz")
@@ -83,7 +84,7 @@ def read_bag(
 
     Refuses with `UserError` what cannot be read so, before anything is made of it.
     """
-    path = Path(path)
+    path = place(path)
     if twist not in ("child", "world"):
         raise UserError(f"twist='{twist}' is unknown; choose child (the robot's frame, ROS's rule) or world.")
     with opened(path) as bag:

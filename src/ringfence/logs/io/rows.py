@@ -109,21 +109,23 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
         raise StoreError(
             f"No agent has two rows; check that {schema.agent} tells agents and {schema.time} their times."
         )
-    return rows if schema.homogeneous else _ended_together(rows)
+    together = rows if schema.homogeneous else _ended_together(rows)
+    if not together.follows.any():
+        raise StoreError(f"{schema.terminated} ends an episode at every row, so that none has a step; check its flags.")
+    return together
 
 
 def _ended_together(rows: Rows) -> Rows:
     """The rows with all of a team ended where one of it has: an episode is of all of them."""
     ended, flagged = rows.ended.copy(), np.flatnonzero(rows.ended)
-    owner = rows.recording[flagged]
-    track = np.flatnonzero(np.append(True, (np.diff(rows.recording) != 0) | (np.diff(rows.agent) != 0)))
-    for first, end in zip(track, [*track[1:], len(ended)]) if len(flagged) else ():
-        begin, stop = (np.searchsorted(owner, rows.recording[first], side) for side in ("left", "right"))
-        moments = rows.time[flagged[begin:stop]]
-        here = rows.time[first:end]
-        last = np.searchsorted(here, moments + JITTER * rows.step, "right") - 1
-        there = (last >= 0) & (last < len(here) - 1) & (here[last] > moments - (1 + JITTER) * rows.step)
-        ended[first + last[there]] = True
+    goes_on = (np.diff(rows.recording) == 0) & (np.diff(rows.agent) == 0)
+    for one in np.unique(rows.recording[flagged]):
+        first, end = (int(np.searchsorted(rows.recording, one, side)) for side in ("left", "right"))
+        moments = np.append(np.unique(rows.time[first:end][ended[first:end]]), np.inf)
+        here, following = rows.time[first : end - 1], rows.time[first + 1 : end]
+        moment = moments[np.searchsorted(moments + JITTER * rows.step, here)]  # the first that a row is the last of
+        last = (moment + JITTER * rows.step < following) & (here > moment - (1 + JITTER) * rows.step)
+        ended[first : end - 1] |= last & goes_on[first : end - 1]
     return replace(rows, ended=ended)
 
 

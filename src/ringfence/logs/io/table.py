@@ -251,6 +251,9 @@ def _columns_of(table: Table, schema: TableSchema, whose: str) -> tuple[Columns,
     if schema.join:
         columns[schema.agent] = _after_the_table(whose, columns, schema)
     columns[schema.time] = dates(schema.time, columns[schema.time], schema.time_format)
+    for name in (schema.time, schema.agent, schema.episode, schema.reward, schema.terminated):
+        if name is not None and columns[name].ndim != 1:
+            raise StoreError(f"{name} has shape {columns[name].shape}; give one entry per row.")
     names = entry_names(table)
     return _expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
 

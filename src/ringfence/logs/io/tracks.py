@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.rows import Rows
@@ -27,9 +28,11 @@ FEW = 5  # rows whose times were rounded another way than most, below which none
 COARSEST = 0.62  # of a step, to which times may be rounded; coarser ones are of a clock that lost a third of its rows,
 SINGLE = 0.8  # but those of single precision, which are rounded to powers of two
 FINEST = 1000  # steps between two rows: more are another unit of time
+MANY = 10  # steps between two rows of a large table
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 STEADY = 0.5  # length of the mean phase of rows that keep their place between steps
 CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
+NOWHERE = 1e-9  # m
 
 
 # --- the clock: how long a step is; rows whose clock drifts or begins late ---
@@ -257,7 +260,7 @@ class _Segments:
         begin = self.time[self.first]
         end = self.time[self.last]
         wanted = float(((end - begin) / dt + 1).sum())
-        if not wanted <= FINEST * (len(self.time) + FINEST):
+        if not wanted <= FINEST * FINEST + MANY * len(self.time):
             raise StoreError(
                 f"Steps of {dt:g} s would be {wanted:.3g} for {len(self.time):,} rows; give a larger dt (times are in "
                 "seconds)."
@@ -371,8 +374,12 @@ def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float)
     """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sensing_radius` m."""
     order = np.lexsort((tracks.step, tracks.recording))
     first, many = _moments(tracks.recording[order], tracks.step[order])
-    found = np.full((len(order), k), -1)
+    found = np.full((len(order), k), -1, np.int32 if len(order) < 2**31 else np.int64)
+    for moment in np.flatnonzero(many.astype(float) ** 2 > CHUNK).tolist():
+        rows = order[first[moment] : first[moment] + many[moment]]
+        found[rows, : many[moment] - 1] = _nearest_of_many(rows, position[rows], k, sensing_radius)
     by_size = np.argsort(many, kind="stable")  # so that little is padded
+    by_size = by_size[many[by_size].astype(float) ** 2 <= CHUNK]
     while len(by_size):
         most = int(np.searchsorted(np.cumsum(many[by_size] ** 2), CHUNK)) + 1
         now = by_size[:most]
@@ -391,4 +398,20 @@ def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float)
             close = np.isfinite(np.take_along_axis(far, who, -1))
             theirs = np.where(close, rows[np.arange(len(now))[:, None, None], who], -1)
             found[rows[there], : theirs.shape[-1]] = theirs[there]
+    return found
+
+
+def _nearest_of_many(rows: np.ndarray, place: np.ndarray, k: int, sensing_radius: float) -> np.ndarray:
+    """(M, k) the same of `rows` (M,) of one moment, by a tree. Of those at one place, whoever is near in the list: an
+    axis that is too short to matter tells them apart, so that a tree of them is none of one leaf."""
+    apart = NOWHERE * np.arange(len(rows)) / len(rows)
+    places = np.column_stack([place - place.mean(0), apart])
+    tree = KDTree(places)
+    found = np.full((len(rows), min(k, len(rows) - 1)), -1)
+    size = max(CHUNK // (k + 1), 1)
+    for start in range(0, len(rows), size):
+        some, most = places[start : start + size], np.nextafter(sensing_radius, np.inf)
+        _, near = tree.query(some, found.shape[1] + 1, distance_upper_bound=most)
+        near = np.asarray(near)[:, 1:]  # oneself is the first
+        found[start : start + size] = np.append(rows, -1)[near]
     return found
