@@ -924,7 +924,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "The safety comes from the guard": shielded_all,
         "On fourteen of sixteen systems a guarded clone never violates": of_again,
         "Print earns more than ours as it is on twelve of thirteen tasks": print_earns_more,
-        "ours earns more on Simple Spread's four tiers, at hardly any cost": values_guide,
+        "ours earns more on Simple Spread's four tiers at hardly any cost": values_guide,
         "exceeds no limit; ours exceeds two": some_exceed,
     },
     "docs/export.md": {"which is no slower": exported_in_time},

@@ -167,7 +167,7 @@ def test_what_does_not_fit_is_refused(make):
         ringfence.padded(Grid, NAMES | {"diesel": ["own.fuel"]})
     with pytest.raises(UserError, match="observation_names has names of solar, who is not in Grid"):
         ringfence.padded(Grid, NAMES | {"solar": ["own.sun"]})
-    with pytest.raises(UserError, match="make_env is a Grid; give a function"):
+    with pytest.raises(UserError, match="make_env is a Grid and not what makes one; give Grid"):
         ringfence.padded(Grid(), NAMES)
     with pytest.raises(StoreError, match="one list of words for all agents.*ringfence.Layout makes such arrays"):
         ringfence.collect(make, episodes=1, card={"observation_names": [["a"], ["b"]]})

@@ -140,8 +140,8 @@ def resolve(spec: PolicySpec) -> Resolved:
 
 
 def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:
-    """A policy whose sampling is guided by the World that its training read, or else would guard it: as asked for, and
-    where a method follows a barrier by itself, if that World is fit to."""
+    """A policy whose sampling is guided by the World that its training read, or else would guard it: by danger and by
+    values as asked for, and where a method follows a barrier by itself, if that World is fit to."""
     asked = policy.options.barrier_guidance
     corrected = spec.guarded and options_of(spec.guard, spec.barrier, {}, **dict(spec.guard_options)).get(
         "correction_steps", 0
@@ -163,9 +163,10 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
     if world is None or (world.barrier is None and not (asked or climbs)):
         return policy
     _check_width(job, world.map, "The World")
+    knows_danger = world.barrier is not None
     if climbs:
         require_values(world.card, spec.anyway)
-    if asked or (climbs and world.barrier is not None):
+    if asked or (climbs and knows_danger):
         require(world.card, spec.anyway)
     elif not climbs and (world.card.verdict or judge(world.card)).word == "unfit" and not spec.anyway:
         _log.warning(
@@ -173,9 +174,8 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
             "or set barrier_guidance=0."
         )
         return policy
-    if not (asked or by_itself) or world.barrier is None and not asked:
-        return guided(policy, world, 0.0)
-    return guided(policy, world, WHOLE if asked is None else asked)
+    of_itself = WHOLE if by_itself and knows_danger else 0.0
+    return guided(policy, world, of_itself if asked is None else asked)
 
 
 def load_job(run: Run, agents: int | None = None) -> Job:
