@@ -227,9 +227,9 @@ class Planner(eqx.Module):
 
         def steered(z: Array, k: Array) -> Array:
             clean = made.plan(made.predict(z, k))
-            if o.value_guidance:
+            if judged is not None and o.value_guidance:
                 clean = self._climbed(made, context[:, -1], judged, clean)
-            if self.guidance:
+            if judged is not None and self.guidance:
                 short = partial(self._short_of_margin, made, context[:, -1], judged)
                 clean = cleared(short, clean, self.guidance, ROUNDS)
             if o.reconcile:
@@ -246,14 +246,14 @@ class Planner(eqx.Module):
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         return lacking(self, judged, action)
 
-    def _climbed(self, made: Generator, present: Array, judged: Array | None, clean: Array) -> Array:
+    def _climbed(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
         """Plans (B, rows, N, D) whose actions are worth more to the World."""
-        assert judged is not None, "a World guides what values guide"
-        rows = min(self.rows_planned, AHEAD_ROWS)
+        world, rows = self.world, min(self.rows_planned, AHEAD_ROWS)
+        assert world is not None, "a World guides what values guide"
 
         def actions_of(x: Array) -> Array:
             plan = self.agreed(self.normaliser.invert(made.inpaint(x)))[:, self.history + 1 :]
-            return self.tracked(present, plan[:, :rows], self.world)
+            return self.tracked(present, plan[:, :rows], world)
 
         how = (self.options.value_guidance, CLIMBS)
         return climbed(actions_of, lambda actions: worth(self, judged, actions), clean, *how)
