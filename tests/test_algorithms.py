@@ -246,6 +246,8 @@ def test_values_steer_what_is_drawn(trained, small_store, small_world):
     unsteered = dataclasses.replace(policy, options=dataclasses.replace(policy.options, value_guidance=0.0))
     first.append(unsteered.act(unsteered.initial_state(8), seen, state, jax.random.key(0))[1].action)
     assert jnp.isfinite(first[0]).all() and jnp.abs(first[0] - first[1]).max() > 0.05
+    with pytest.raises(UserError, match="worse than by their mean, and these options climb them"):
+        load(trained["icbf"], planner="value_guided")
 
 
 def test_what_is_climbed_moves_actions_by_what_is_asked_and_stays_in_bounds():
