@@ -787,7 +787,7 @@ def values_guide() -> tuple[bool, str]:
         low, high = mean_of_runs(steered - plain)
         cost = max(r["cost_safe_start"] for r in both[0])
         printed = planner_tables.paper.PRINTED[task][1][2][0]
-        holds = holds and low > 0 and cost <= 0.05 and steered.mean() > printed
+        holds = holds and low > 0 and cost <= 0.05 and steered.mean() > printed and len(steered) >= 3
         words.append(f"{task} {steered.mean():.2f} [{low:+.3f}, {high:+.3f}] at {cost}, {len(steered)} seeds")
     hall = [
         planner_tables.played(planner_tables.rows_of("values", "proving-hall"), "icbf", way)[0]["cost"]
