@@ -777,23 +777,22 @@ def wide_plans_pay() -> tuple[bool, str]:
 
 @on("results/planner")
 def values_guide() -> tuple[bool, str]:
-    """Plans that values guide, and the same runs' without, by the same resets of Spread's tiers."""
+    """Plans that values guide, and the same runs' without, on the same resets of Spread's tiers; and the cost of both
+    on a system whose danger the first step alone does not tell."""
+
+    def both(task: str) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [planned("values", task, "icbf", way) for way in ("value guidance", "as it is")]
+
     words, holds = [], True
     for task in planner_tables.SPREAD:
         task = f"simple_spread-{task}"
-        rows = planner_tables.rows_of("values", task)
-        both = [planner_tables.played(rows, "icbf", way) for way in ("value guidance", "as it is")]
-        steered, plain = (TASKS[task].normalised_return(x) for x in planner_tables.paired(*both))
+        (steered, cost), (plain, _) = both(task)
         low, high = mean_of_runs(steered - plain)
-        cost = max(r["cost_safe_start"] for r in both[0])
         printed = planner_tables.paper.PRINTED[task][1][2][0]
-        holds = holds and low > 0 and cost <= 0.05 and steered.mean() > printed and len(steered) >= 3
-        words.append(f"{task} {steered.mean():.2f} [{low:+.3f}, {high:+.3f}] at {cost}, {len(steered)} seeds")
-    hall = [
-        planner_tables.played(planner_tables.rows_of("values", "proving-hall"), "icbf", way)[0]["cost"]
-        for way in ("as it is", "value guidance")
-    ]
-    return bool(holds and hall[1] < 0.1 * hall[0]), "; ".join(words)
+        holds = holds and low > 0 and cost.max() <= 0.05 and steered.mean() > printed and len(steered) >= 3
+        words.append(f"{task} {steered.mean():.2f} [{low:+.3f}, {high:+.3f}] at {cost.max()}, {len(steered)} seeds")
+    (_, left), (_, cost) = both("proving-hall")
+    return bool(holds and left.mean() < 0.1 * cost.mean()), "; ".join(words)
 
 
 @on("results/planner")

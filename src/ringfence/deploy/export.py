@@ -36,7 +36,7 @@ from jax.extend import core
 
 from ringfence import __version__
 from ringfence.deploy.jaxpr import Interpreter, bind, draws, live, operations, value, values_of
-from ringfence.errors import UserError, needs, unknown
+from ringfence.errors import UserError, needs, reason, unknown
 from ringfence.evaluation.certificate import digest
 from ringfence.guards import Guarded
 from ringfence.loading.resolve import Resolved, resolve
@@ -280,8 +280,9 @@ def as_onnx(step: Step) -> Any:
         session = runtime(model.SerializeToString(), providers=["CPUExecutionProvider"])
         session.run(None, {x.name: np.zeros(x.shape, x.dtype) for x in step.inputs})
     except Exception as error:
-        what = str(error).splitlines()[0]
-        raise UserError(f"The ONNX file of this policy would not run ({what}); write it as StableHLO.") from error
+        raise UserError(
+            f"The ONNX file of this policy would not run ({reason(error)}); write it as StableHLO."
+        ) from error
     return model
 
 

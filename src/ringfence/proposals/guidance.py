@@ -42,9 +42,17 @@ def short_of_margin(
     action: Array,
     ahead: bool = True,
 ) -> Array:
-    """(B,) what the states after actions (B, N, A) lack of the margin, in all agents: 0 or negative. As guards do, it
-    trusts less where the ensemble disagrees. `ahead`: V is asked, too."""
-    after, spread = dynamics.step(present, action)
+    """(B,) what the states after actions (B, N, A) lack of the margin, in all agents: 0 or negative. `ahead`: V is
+    asked, too."""
+    return _short(barrier, ood_threshold, present, dynamics.step(present, action), ahead)
+
+
+def _short(
+    barrier: Barrier | MinBarrier, ood_threshold: Array, present: Array, step: tuple[Array, Array], ahead: bool
+) -> Array:
+    """The same of a predicted step, the states after it and how far the ensemble disagrees; as guards do, it trusts
+    less where that is much."""
+    after, spread = step
     score = barrier.apart(present, after)
     score = jnp.minimum(score, barrier.ahead_apart(after)) if ahead else score
     doubt = jnp.maximum(spread / ood_threshold - 1.0, 0.0)
@@ -100,9 +108,11 @@ def worth(policy: TakesGuidance, present: Array, actions: Array) -> Array:
     assert world is not None, "set by guided"
 
     def step(x: Array, action: Array) -> tuple[Array, tuple[Array, Array]]:
-        short = jnp.zeros(len(x)) if world.barrier is None else lacking(policy, x, action)
-        after = world.dynamics.step(x, action)[0]
-        return after, (after, short)
+        predicted = world.dynamics.step(x, action)
+        short = jnp.zeros(len(x))
+        if world.barrier is not None:
+            short = _short(world.barrier, world.ood_threshold, x, predicted, policy.ahead)
+        return predicted[0], (predicted[0], short)
 
     _, (rows, short) = jax.lax.scan(step, present, jnp.moveaxis(actions, 1, 0))
     rows = jnp.concatenate([present[:, None], jnp.moveaxis(rows, 0, 1)], 1)

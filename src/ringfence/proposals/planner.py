@@ -113,7 +113,7 @@ class Planner(eqx.Module):
             anew = lambda: self.plans(past, present, key, 1, driver, judged)[:, 0]  # noqa: E731
             plan = jax.lax.cond(fresh, anew, lambda: carry["plan"])
             ahead = jnp.take(plan, self.history + 1 + carry["age"] % o.replan, axis=1)
-        action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
+        action = self.towards(present, ahead)
         info = {"plans": plan[:, None], "chosen": jnp.zeros(plan.shape[0], jnp.int32)}
         return self._kept(carry, past, present, plan), PolicyStep(from_unit(action, self.spec), info)
 
@@ -243,8 +243,7 @@ class Planner(eqx.Module):
     def _short_of_margin(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
         """(B,) what the World says that the first step of plans (B, rows, N, D) lacks of the margin."""
         ahead = self.agreed(self.normaliser.invert(made.inpaint(clean)))[:, self.history + 1]
-        action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
-        return lacking(self, judged, action)
+        return lacking(self, judged, self.towards(present, ahead))
 
     def _climbed(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
         """Plans (B, rows, N, D) whose actions are worth more to the World."""
@@ -263,9 +262,13 @@ class Planner(eqx.Module):
         present (B, N, D): along what the World foresees, if it reads the same view, else along the plans."""
         same, x, actions = world.map.names == self.feature_map.names, present, []
         for row in jnp.moveaxis(rows, 1, 0):
-            actions.append(jnp.clip(infer_action(self.networks["inverse"], self.normaliser, x, row), -1.0, 1.0))
+            actions.append(self.towards(x, row))
             x = world.dynamics.step(x, actions[-1])[0] if same else row
         return jnp.stack(actions, 1)
+
+    def towards(self, x: Array, row: Array) -> Array:
+        """Actions (B, N, A) in [−1, 1] that inverse dynamics reads off a step from features (B, N, D) to others."""
+        return jnp.clip(infer_action(self.networks["inverse"], self.normaliser, x, row), -1.0, 1.0)
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""

@@ -137,9 +137,8 @@ def dates(name: str, column: np.ndarray, written: str | None = None) -> np.ndarr
     """A column of dates that are `written` as text (by default as ISO 8601) as dates; one of no dates as it is. Those
     with an offset are counted in UTC, and a column in which some have one is left to be refused."""
     if written is not None and (column.dtype.kind in "iu" or (column.dtype.kind == "f" and _reads_as_dates(column))):
-        column = (column.astype(np.int64) if column.dtype.kind == "f" else column).astype(
-            str
-        )  # as the text that a file's would be
+        whole = column.astype(np.int64) if column.dtype.kind == "f" else column
+        column = whole.astype(str)  # as the text that a file's would be
     if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
         return column
     read = [_date(entry, written) for entry in column.tolist()]
