@@ -87,6 +87,24 @@ def test_logs_of_single_precision_are_left_as_they_are():
     assert any("write the column in double precision" in warning for warning in store.card.warnings)
 
 
+def test_velocities_and_flags_are_not_moved():
+    """They mean what they say: a speed limit reads 30 m/s, and a replay who is seen."""
+    generator = np.random.default_rng(0)
+    shape = (5, 21, 1)
+    names = ["own.x", "own.vx", "other0.dx", "other0.seen", "speed", "beacon"]
+    fine = 1e-5 * np.cumsum(generator.normal(size=(*shape, len(names))), 1)
+    fine[..., 3] = 0.0
+    seen = np.array([NORTH, 30.0, 1.0, 1.0, 30.0, NORTH]) + fine
+    arrays = np.zeros((5, 20, 1, 1)), np.zeros((5, 20)), np.zeros((5, 20))
+    store = EpisodeStore.from_episodes(seen, *arrays, card={"observation_names": names})
+    assert [bool(x) for x in store.card.observation_origins] == [True, False, False, False, False, True]
+    np.testing.assert_allclose(store.observations[..., 1:5].mean((0, 1)), [30.0, 1.0, 1.0, 30.0], atol=1e-3)
+    drifting = np.full((*shape, 2), NORTH) * (1 + 1e-16 * generator.normal(size=(*shape, 2)))
+    drifting[..., 1] = 1e-3 * np.arange(21)[:, None]
+    still = EpisodeStore.from_episodes(drifting, *arrays)
+    assert still.card.observation_origins is None, "rounding is no motion"
+
+
 def test_entries_that_share_a_place_share_an_origin():
     """Of arrays, too, and of a state beside observations; what stands still there moves along."""
     generator = np.random.default_rng(0)

@@ -1,18 +1,24 @@
-"""Logs are moved towards 0 where their numbers lie so far from it that single precision blurs their steps."""
+"""Logs are moved towards 0 where their numbers lie so far from it that single precision blurs their steps.
+
+Places are moved, and what no name tells. Velocities, offsets and flags mean what they say, to dangers and replays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ringfence.logs.schema import LARGEST, StoreCard
+from ringfence.problem.entries import Entries, loosely
 
 COARSE = 0.01  # of what an entry changes by in a step: the distance of neighbouring numbers above which it is coarse
 FAR = 8.0  # times the range of an entry that it is away from 0, so that moving it gains three bits or more
 SHARED = 0.1  # of their size: entries that are as near to each other are moved together, so that they still compare
 STEPS = 20_000  # that are looked at, at most
+ROUNDED = 4 * np.finfo(np.float64).eps  # of a number: what changes by less does not change
+Names = Mapping[str, Sequence[str] | None]  # of the entries of arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +27,7 @@ class _Entry:
 
     least: float
     most: float
+    moves: bool
     is_coarse: bool
 
     @property
@@ -28,7 +35,7 @@ class _Entry:
         return (self.least + self.most) / 2
 
     def near(self, value: float) -> bool:
-        return max(abs(self.least - value), abs(self.most - value)) <= SHARED * abs(value)
+        return self.moves and max(abs(self.least - value), abs(self.most - value)) <= SHARED * abs(value)
 
 
 def gap_at(largest: np.ndarray) -> np.ndarray:
@@ -47,7 +54,8 @@ def moved(
     precise = {name: array for name, array in given.items() if array is not None and array.dtype.itemsize > 4}
     if precise and not card.origins:
         rows = looked_at(episode_ends)
-        for name, origins in origins_of({name: (x[rows], x[rows + 1]) for name, x in precise.items()}).items():
+        names = {"observations": card.observation_names, "state": card.state_names}
+        for name, origins in origins_of({name: (x[rows], x[rows + 1]) for name, x in precise.items()}, names).items():
             given[name] = precise[name] - origins
             card = moved_by(card, name, origins)
     near = {name: None if x is None else x.astype(np.float32, copy=False) for name, x in given.items()}
@@ -74,14 +82,16 @@ def looked_at(episode_ends: np.ndarray) -> np.ndarray:
     return steps + np.searchsorted(episode_ends, steps, side="right")
 
 
-def origins_of(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
+def origins_of(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], names: Names) -> dict[str, np.ndarray]:
     """(D,) what to take from the entries of arrays, of those of which something is to be taken; of each the rows that
-    are looked at, before and after a step, (K, ..., D).
+    are looked at, before and after a step, (K, ..., D), and what its entries are called.
 
     Entries whose numbers are near to each other have the same origin, whatever array they are of: their differences
     stay what they are.
     """
-    entries = {name: list(_entries(*pair)) for name, pair in pairs.items()}
+    entries = {
+        name: list(_entries(*pair, _may_move(names.get(name), pair[0].shape[-1]))) for name, pair in pairs.items()
+    }
     found = {name: np.zeros(len(each)) for name, each in entries.items()}
     for members in _clusters([one for each in entries.values() for one in each]):
         origin = _round(min(one.least for one in members), max(one.most for one in members))
@@ -90,20 +100,34 @@ def origins_of(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, 
     return {name: origins for name, origins in found.items() if origins.any()}
 
 
-def _entries(before: np.ndarray, after: np.ndarray) -> Iterator[_Entry]:
+def _may_move(names: Sequence[str] | None, size: int) -> np.ndarray:
+    """(D,) entries that are places, or may be."""
+    if names is None or len(names) != size:
+        return np.ones(size, bool)
+    whose = {entry.source: entry for entry in Entries.of(names).each}
+    found = []
+    for d, name in enumerate(names):
+        role, what = (whose[d].role, whose[d].what) if d in whose else (None, name)
+        role = loosely(what)[0] if role in (None, "number") else role
+        found.append(role in (None, "place") and what != "seen")
+    return np.array(found)
+
+
+def _entries(before: np.ndarray, after: np.ndarray, may_move: np.ndarray) -> Iterator[_Entry]:
     for d in range(before.shape[-1]):
         first = before[..., d]
         values = np.stack([first, after[..., d]]).astype(np.float64)
         if not (np.abs(values) <= LARGEST).all():  # refused later, by name
-            yield _Entry(0.0, 0.0, False)
+            yield _Entry(0.0, 0.0, False, False)
             continue
         least = float(values.min())
         most = float(values.max())
         change = np.abs(values[1] - values[0])
-        usual = float(np.median(change[change > 0])) if (change > 0).any() else 0.0
+        changes = change > ROUNDED * np.abs(values).max(0)
+        usual = float(np.median(change[changes])) if changes.any() else 0.0
         far = abs(least + most) / 2 >= FAR * (most - least)
         blurred = float(gap_at(np.array(max(-least, most)))) > COARSE * usual
-        yield _Entry(least, most, usual > 0 and far and blurred)
+        yield _Entry(least, most, bool(may_move[d]), bool(may_move[d]) and usual > 0 and far and blurred)
 
 
 def _clusters(entries: list[_Entry]) -> Iterator[list[_Entry]]:

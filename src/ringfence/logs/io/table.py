@@ -370,7 +370,8 @@ def _arrays(
         origins = origins if origins.any() else None
     elif not lost and not card.get("observation_origins"):
         before, after = (episodes.seen(rows[each]) for each in (steps, steps + 1))
-        origins = origins_of({"observations": (before, after)}).get("observations")
+        found = origins_of({"observations": (before, after)}, {"observations": facts["observation_names"]})
+        origins = found.get("observations")
     return {
         "observations": episodes.observations(np.zeros(len(episodes.entries)) if origins is None else origins),
         "origins": origins,
