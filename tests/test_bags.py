@@ -359,6 +359,7 @@ def test_agents_by_pattern_and_by_list(tmp_path):
     tracks["/bot7/cmd_vel"] = [command("/bot7/cmd_vel", 0.0)]  # no agent, since it has no odometry
     path = write(tmp_path, [m for track in tracks.values() for m in track])
     assert read_bag(path, "/bot{i}").agents == ("bot9", "bot10", "botx")
+    assert "left out, since they have commands and no poses: /bot7" in read_bag(path, "/bot{i}").notes
     assert read_bag(path, "fleet/{i}/base/").agents == ("fleet/a1/base",)
     assert read_bag(path, ["/other", "bot9"]).columns["agent"].tolist() == ["other", "bot9"]
     assert read_bag(path, "/other").agents == ("other",)
@@ -376,6 +377,27 @@ def test_agents_by_pattern_and_by_list(tmp_path):
         read_bag(path, "/bot{i}", twist="body")
     root = write(tmp_path, [odometry("/odom", 0.0), command("/cmd_vel", 0.0)], "bag")
     assert read_bag(root, "/").agents == ("robot",)
+
+
+def test_heights_late_clocks_and_commands_between_rows_are_noted(tmp_path):
+    """A bag is read in the plane; a clock that is off by rows shifts commands; a command between two rows is lost."""
+
+    def notes(messages):
+        return "; ".join(read_bag(write(tmp_path, messages), "/a").notes)
+
+    times = np.arange(20) * 0.5
+    poses = [odometry("/a/odom", t, x=t) for t in times]
+    each = [command("/a/cmd_vel", t, vx=1.0) for t in times]
+    assert not any(word in notes(poses + each) for word in ("plane", "stamps", "between"))
+    for k, (_, _, _, fields) in enumerate(poses):
+        fields["pose"]["pose"]["position"]["z"] = 0.1 * k
+    assert "z, which goes from 0 to 1.9 m, is left out" in notes(poses + each)
+    fast = [command("/a/cmd_vel", t, vx=float(k % 5 == 0)) for k, t in enumerate(np.arange(100) * 0.1)]
+    assert "of 100 commands of a came between its rows" in notes(poses + fast)
+    late = [odometry("/a/odom", t, x=t, stamp=ns(t - 0.9)) for t in times]
+    assert "stamps of '/a/odom' are 0.903 s behind the times of recording, more than a row" in notes(late + each)
+    jump = [odometry("/a/odom", t, x=t, stamp=ns(t + 3.0 * (t > 7.0))) for t in times]
+    assert "stamps of '/a/odom' jump by up to 3 s" in notes(jump + each)
 
 
 def test_doubts_are_noted(tmp_path):

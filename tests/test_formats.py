@@ -19,6 +19,7 @@ from ringfence.logs.io.observe import observe
 from ringfence.logs.io.rows import utm, zone_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation
+from ringfence.problem.entries import Entries
 from tests.test_tables import NAMES, entry, fleet
 
 JOINTS = ["waist", "elbow", "gripper"]
@@ -407,6 +408,28 @@ def test_angles_in_degrees_are_asked_for_by_name():
         EpisodeStore.from_table(table, **options)
     renamed = NAMES | {"state": ["x", "y", "heading_deg"], "rename": {"heading": "heading_deg"}}
     assert "own.cos_heading_deg" in EpisodeStore.from_table(table, **renamed).card.observation_names
+
+
+@pytest.mark.parametrize("turn, unit", [(360.0, "_deg"), (2 * np.pi, "")])
+def test_an_angle_that_no_name_tells_is_refused(turn, unit):
+    """Between rows at 358 and 2 degrees there would be half a turn; a reading that drops to 0 is none."""
+    time = np.arange(200) * 0.1
+    table = dict(t=time, id=0 * time, x=np.sin(time), y=time, hdg=(0.9 + 0.013 * np.arange(200)) % 1 * turn)
+    options = dict(time="t", agent="id", state=["x", "y", "hdg"])
+    with pytest.raises(StoreError, match=f"row 8: hdg jumps .* a turn, .*--rename hdg=heading{unit}"):
+        EpisodeStore.from_table(table, **options)
+    named = options | {"state": ["x", "y", f"heading{unit}"], "rename": {"hdg": f"heading{unit}"}}
+    store = EpisodeStore.from_table(table, **named)
+    assert Entries.of(store.card.observation_names).direction, "it says where one looks"
+    table["hdg"] = np.where(np.arange(200) % 50 == 30, 0.0, 0.95 * turn)
+    assert "own.hdg" in EpisodeStore.from_table(table, **options).card.observation_names
+
+
+def test_degrees_are_not_converted_twice():
+    table = fleet() | {"heading_deg": np.linspace(0, 300, len(fleet()["t"]))}
+    with pytest.raises(UserError, match="heading_deg is made radians of by its name; leave its scale"):
+        options = NAMES | {"state": ["x", "y", "heading_deg"], "scale": {"heading_deg": np.pi / 180}}
+        EpisodeStore.from_table(table, **options)
 
 
 # --- what is doubtful ---

@@ -13,6 +13,7 @@ import numpy as np
 
 SPACE, LANE = "xyz", "sd"  # axes: of a plane or space; along a lane and aside
 HEADINGS = ("heading", "yaw", "theta", "psi")  # angles from the first axis towards the second, rad
+DEGREES, RADIANS = ("_deg", "_degrees"), ("_rad", "_radians")  # after the name of an angle
 SPEEDS = ("v", "speed")
 _NAME = re.compile(r"([a-z_]+?)([0-9]{0,9})\.(.+)")
 _WORD = re.compile(r"\w+")
@@ -126,9 +127,9 @@ class Entries:
     @cached_property
     def direction(self) -> tuple[int, ...]:
         """Entries of where one looks: its cosine and sine, or an angle; none where names tell none."""
-        for cos, sin in (("cos", "sin"), *((f"cos_{word}", f"sin_{word}") for word in HEADINGS)):
-            if cos in self.own and sin in self.own:
-                return self.own[cos], self.own[sin]
+        for angle in ("", *(f"_{word}{unit}" for word in HEADINGS for unit in ("", *DEGREES, *RADIANS))):
+            if f"cos{angle}" in self.own and f"sin{angle}" in self.own:
+                return self.own[f"cos{angle}"], self.own[f"sin{angle}"]
         return next(((self.own[word],) for word in HEADINGS if word in self.own), ())
 
     @cached_property

@@ -37,7 +37,7 @@ class Topic:
 
 # --- what is in a message ---
 def _pose(position, orientation) -> tuple[float, ...]:
-    return position.x, position.y, orientation.x, orientation.y, orientation.z, orientation.w
+    return position.x, position.y, orientation.x, orientation.y, orientation.z, orientation.w, position.z
 
 
 def _odometry(m) -> tuple[float, ...]:

@@ -28,6 +28,8 @@ CLOCK = 1.0  # s; stamps further from the times of recording come from another c
 LATE = 5.0  # s; a stamp so much further from its time of recording than the topic's others is of another time
 JOINTS = 1000  # names of joints that a topic may hold
 LARGEST = 1e30  # of any number; a store holds float32
+PASSED_OVER = 0.05  # share of the commands that come between rows, above which it is said
+LEVEL = 0.5  # m; what changes its height by more does not move in a plane
 MOVING = 0.05  # m/s; slower rows do not tell in which frame a twist is
 
 
@@ -88,11 +90,11 @@ def read_bag(
     if twist not in ("child", "world"):
         raise UserError(f"twist='{twist}' is unknown; choose child (the robot's frame, ROS's rule) or world.")
     with opened(path) as bag:
-        asked = _asked_of(bag, _prefixes(bag, agents, odom), odom, cmd, joints, cost)
+        notes: list[str] = []
+        asked = _asked_of(bag, _prefixes(bag, agents, odom, cmd or CMD, notes), odom, cmd, joints, cost)
         topics = bag.read({own[role]: role for role in ROLES for _, own in asked if role in own})
         start = bag.start(topics)
     robots = [_Robot(name, **{role: topics[topic] for role, topic in own.items()}) for name, own in asked]
-    notes: list[str] = []
     clock = _clock(path, robots, topics, start, stamps, notes)
     return _table(path, robots, clock, twist, notes)
 
@@ -104,6 +106,10 @@ def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: li
         shown = ", ".join(f"'{f}'" for f in frames[:SHOWN]) + (" and more" if len(frames) > SHOWN else "")
         notes.append(f"poses are in {len(frames)} frames ({shown}); positions compare only if these have one origin")
     _refuse_two_kinds(path, robots)
+    heights = np.concatenate([[value[6] for value in robot.odom.values] for robot in robots])
+    if np.ptp(heights) > LEVEL:
+        low, high = heights.min(), heights.max()
+        notes.append(f"bags are read in the plane: z, which goes from {low:.4g} to {high:.4g} m, is left out")
     parts = [_columns_of(path, robot, clock, twist, notes) for robot in robots]
     _refuse_other_joints(path, robots, parts)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in ("time", *parts[0])}
@@ -161,20 +167,28 @@ def _asked_of(
     return found
 
 
-def _prefixes(bag: BagFile, agents: str | Sequence[str], odom: str) -> list[str]:
-    """Agents' prefixes, "" of topics at the root; those of a pattern in natural order."""
+def _prefixes(bag: BagFile, agents: str | Sequence[str], odom: str, cmd: str, notes: list[str]) -> list[str]:
+    """Agents' prefixes, "" of topics at the root; those of a pattern in natural order, without such as have commands
+    and no poses."""
     if not isinstance(agents, str):
         prefixes = ["/" + prefix.strip("/") if prefix.strip("/") else "" for prefix in agents]
         if not prefixes or len(set(prefixes)) < len(prefixes):
             raise UserError(f"agents={list(agents)} is empty or names one twice; list every agent's prefix once.")
         return prefixes
     if "{" not in agents:
-        return _prefixes(bag, [agents], odom)
+        return _prefixes(bag, [agents], odom, cmd, notes)
     if agents.count("{i}") != 1 or "{" in agents.replace("{i}", ""):
         raise UserError(f"agents='{agents}' must hold {{i}} once, and no other braces; write it as '/robot_{{i}}'.")
     before, after = ("/" + agents.strip("/")).split("{i}")
-    pattern = re.compile(rf"{re.escape(before)}(\w+){re.escape(after)}/{re.escape(odom.strip('/'))}")
-    found = {match[1] for match in map(pattern.fullmatch, bag.topics) if match}
+
+    def having(topic: str) -> set[str]:
+        pattern = re.compile(rf"{re.escape(before)}(\w+){re.escape(after)}/{re.escape(topic.strip('/'))}")
+        return {match[1] for match in map(pattern.fullmatch, bag.topics) if match}
+
+    found = having(odom)
+    if found and (unseen := having(cmd) - found):
+        names = ", ".join(f"{before}{word}{after}" for word in sorted(unseen, key=natural)[:SHOWN])
+        notes.append(f"left out, since they have commands and no poses: {names}")
     if not found:
         raise StoreError(
             f"The pattern '{agents}' matches no agent: {bag.lacks(joined(agents, odom))}; pass another pattern or odom."
@@ -228,6 +242,18 @@ def _clock(
             f"stamps are {behind:.3g} s behind the times of recording, so they come from another clock; time counts "
             "from the first of them"
         )
+    bare_commands = {robot.odom.name for robot in robots if robot.cmd is not None and robot.cmd.name not in stamped}
+    for topic in [t for t in odometry if t.name in stamped and len(t.logged) > 1 and not foreign]:
+        lag = lags[topic.name].seconds
+        usual, most = float(np.median(lag)), float(np.abs(lag - np.median(lag)).max())
+        step = float(np.median(np.diff(topic.logged))) / 1e9
+        if abs(usual) > step and (len(odometry) > 1 or topic.name in bare_commands):
+            notes.append(
+                f"stamps of '{topic.name}' are {usual:.3g} s behind the times of recording, more than a row, and are "
+                "believed; pass stamps=False if its clock is wrong"
+            )
+        if most > CLOCK:
+            notes.append(f"stamps of '{topic.name}' jump by up to {most:.3g} s; see whether its clock was set")
     bare = [t.name for t in odometry if t.name not in stamped]
     if bare and stamps:
         notes.append(f"{', '.join(bare)} has no stamps, so its times are those of recording")
@@ -304,7 +330,9 @@ def _columns_of(path: Path, robot: _Robot, clock: Clock, twist: str, notes: list
     if robot.cmd is not None:
         latest = _latest(*clock.align(rows, robot.cmd))
         command = _command_of(robot.cmd)
-        commands = _numbers(robot.cmd, command)[latest]
+        given = _numbers(robot.cmd, command)
+        commands = given[latest]
+        _note_passed_over(robot.name, given, latest, notes)
         columns |= {name: commands[:, i] for i, name in enumerate(command)}
         known = latest >= 0
     if robot.joints is not None:
@@ -319,6 +347,15 @@ def _columns_of(path: Path, robot: _Robot, clock: Clock, twist: str, notes: list
         columns["cost"] = _costs(robot.cost, *clock.align(rows, robot.cost), robot.name, notes)
     _note_unknown(path, robot, known, notes)
     return {name: column[known] for name, column in columns.items()}
+
+
+def _note_passed_over(name: str, given: np.ndarray, latest: np.ndarray, notes: list[str]) -> None:
+    """Commands (M, C) that no row holds and that differ from the next."""
+    held = np.zeros(len(given), bool)
+    held[latest[latest >= 0]] = True
+    between = ~held & np.append((given[1:] != given[:-1]).any(1), False) & (np.arange(len(given)) < latest.max())
+    if between.sum() > PASSED_OVER * len(given):
+        notes.append(f"{between.sum()} of {len(given)} commands of {name} came between its rows, and count nowhere")
 
 
 def _command_of(topic: Topic) -> tuple[str, ...]:
@@ -390,8 +427,8 @@ def _finite(topic: Topic, messages: np.ndarray, values: np.ndarray, names: Seque
 def _poses(topic: Topic, time: np.ndarray, twist: str, notes: list[str]) -> dict[str, np.ndarray]:
     """Columns (M,) of a topic's poses, and of its velocities if it is Odometry."""
     moves = topic.type == "nav_msgs/msg/Odometry"
-    values = _numbers(topic, ("x", "y", "qx", "qy", "qz", "qw", *(TWIST if moves else ())))
-    x, y, qx, qy, qz, qw = values[:, :6].T
+    values = _numbers(topic, ("x", "y", "qx", "qy", "qz", "qw", "z", *(TWIST if moves else ())))
+    x, y, qx, qy, qz, qw, _ = values[:, :7].T
     null = np.flatnonzero(np.linalg.norm(values[:, 2:6], axis=1) < 1e-6)
     if len(null):
         raise StoreError(
@@ -405,7 +442,7 @@ def _poses(topic: Topic, time: np.ndarray, twist: str, notes: list[str]) -> dict
     columns = {"time": time, "x": x, "y": y, "yaw": yaw, "cos_yaw": cos, "sin_yaw": sin}
     if not moves:
         return columns
-    vx, vy, wz = values[:, 6:].T
+    vx, vy, wz = values[:, 7:].T
     ways = {"child": np.stack([cos * vx - sin * vy, sin * vx + cos * vy], 1), "world": np.stack([vx, vy], 1)}
     _doubt(topic, time, values[:, :2], ways, twist, notes)
     return columns | {"vx": ways[twist][:, 0], "vy": ways[twist][:, 1], "wz": wz}

@@ -16,6 +16,7 @@ import numpy as np
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
+from ringfence.problem.entries import DEGREES, RADIANS
 from ringfence.utils.text import numbered
 
 COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
@@ -38,9 +39,9 @@ REACH = 9.0  # degrees from a zone's middle, beyond which distances are off by m
 POLES = 84.0  # degrees of latitude, where UTM ends
 
 ANGLES = ("theta", "yaw", "heading", "compass", "course", "bearing", "psi")
-DEGREES = ("_deg", "_degrees")
-RADIANS = ("_rad", "_radians")
 TURN = 2 * np.pi + 1e-6
+TURNS = {360.0: "_deg", 2 * np.pi: ""}  # by which angles jump, and what is added to their names
+APART = 0.1  # of a turn: as near to none or to a whole one an angle changes from row to row
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,9 +370,11 @@ def _late_recordings(rows: Rows, share: float) -> np.ndarray:
 # --- units ---
 def in_metres(columns: Columns, schema: TableSchema) -> tuple[Columns, list[str]]:
     """The columns in SI units, as the schema's `scale` and `project` say, and what was made of degrees."""
-    for name in schema.scale:
+    for name, factor in schema.scale.items():
         if name not in schema.numbers:
             raise unknown("column of numbers", name, schema.numbers)
+        if _plain(name) in ANGLES and _in_degrees(name) and abs(factor / np.deg2rad(1.0) - 1) < 0.01:
+            raise UserError(f"{name} is made radians of by its name; leave its scale={factor:.6g} out.")
     columns = columns | {name: _times(columns, name, factor) for name, factor in schema.scale.items()}
     if schema.project != "utm":
         return columns, []
@@ -436,6 +439,27 @@ def _middle(zone: int) -> float:
 
 
 # --- angles ---
+def refuse_turns(rows: Rows, values: Values, schema: TableSchema) -> None:
+    """Refuse entries that jump by whole turns, as angles do that no name tells: halfway between two rows there would
+    be half a turn."""
+    for name in set(schema.state) - {*schema.position, *schema.velocity}:
+        value = values.columns[name]
+        change = np.abs(np.diff(value))[rows.follows]
+        for turn, unit in TURNS.items():
+            jumps = change > (1 - APART) * turn
+            if not jumps.any() or (jumps != (change > APART * turn)).any() or np.ptp(value) > turn * (1 + 1e-6):
+                continue
+            before = np.flatnonzero(rows.follows)[jumps]
+            if not np.minimum(np.abs(value[before]), np.abs(value[before + 1])).any():
+                continue  # a reading that is 0 now and then
+            k = before[0]
+            raise StoreError(
+                f"row {int(rows.order[k + 1])}: {name} jumps from {value[k]:.4g} to {value[k + 1]:.4g}, a turn, so it "
+                f"is an angle; call it heading{unit} if it says where one looks (--rename {name}=heading{unit}), else "
+                f"course{unit} or bearing{unit}, of which cosine and sine are made."
+            )
+
+
 def without_angles(columns: Columns, schema: TableSchema) -> tuple[Columns, TableSchema, list[str]]:
     """The columns and the schema with `cos_yaw` and `sin_yaw` instead of `yaw`, and a note. Angles are known by their
     names; they are in radians, `compass` and what ends in `_deg` in degrees."""

@@ -41,6 +41,7 @@ from ringfence.logs.io.rows import (
     in_metres,
     parted,
     refuse_jumps,
+    refuse_turns,
     sorted_rows,
     values_of,
     without_angles,
@@ -51,6 +52,7 @@ from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_
 from ringfence.logs.moving import looked_at, origins_of
 from ringfence.problem.constraints import CostColumn
 
+PASSED_OVER = 0.05  # share of the rows at which commands change, above which longer steps are said to pass some over
 USUAL = 0.999  # of accelerations, that are no outliers
 RECORDING = "ringfence.recording"  # column that tells apart what is of several tables
 AGENT, COLUMN = "{agent}", "{column}"  # in how wide tables call columns
@@ -130,6 +132,7 @@ def read_parts(
     values = values_of(columns, rows, schema)
     rows, values, dropped = without_jumps(rows, values, schema)
     refuse_jumps(rows, values, schema)
+    refuse_turns(rows, values, schema)
     rows, rounded = unrounded(rows)
     clock = clock_of(rows, schema)
     doubtful = list(doubts(rows, values, clock.dt, schema))
@@ -140,6 +143,7 @@ def read_parts(
     rows, drifts = on_whole_steps(rows, clock)
     if schema.dt is None:
         drifts += off_the_clock(rows, clock)
+    drifts += _passed_over(rows, values, clock, schema)
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
@@ -285,6 +289,16 @@ def _after_the_table(whose: str, columns: Columns, schema: TableSchema) -> np.nd
     if schema.agent not in columns:
         return np.full(len(columns[schema.time]), whose)
     return np.array([f"{whose}/{name}" for name in words(columns, schema.agent)])
+
+
+def _passed_over(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> list[str]:
+    """What to say of commands that come between steps which are longer than the rows are apart."""
+    if not schema.action or clock.dt < 1.5 * rows.step:
+        return []
+    other = (np.diff(values.stacked(schema.action), axis=0) != 0).any(1)[rows.follows]
+    share = float(other.mean()) if len(other) else 0.0
+    said = f"commands change at {100 * share:.0f} % of the rows, every {rows.step:.4g} s; of a step of {clock.dt:.4g} s"
+    return [f"{said} the first counts alone"] if share > PASSED_OVER else []
 
 
 def _on_clock(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Tracks:
