@@ -750,49 +750,40 @@ def planner_reaches(task: str, least: float, most: float, seeds: int = 5) -> Che
 
 @on("results/planner")
 def guidance_takes_cost() -> tuple[bool, str]:
-    """On both logs, return gained and cost left by guidance, on the same runs and resets."""
+    """On both logs, return gained and cost left where danger alone guides, on the same runs and resets."""
     words, holds = [], True
     for task in (LEARNER, FIVE):
-        (guided, left), (alone, cost) = (planned("rows", task, "icbf", way) for way in ("as it is", "alone"))
+        (guided, left), (alone, cost) = (planned("rows", task, "icbf", way) for way in ("danger alone", "alone"))
         low, high = mean_of_runs(guided - alone)
-        holds = holds and low > 0 and left.mean() < 0.03 * cost.mean()
+        holds = holds and low > -0.01 and left.mean() < 0.03 * cost.mean()
         words.append(f"{task} [{low:+.3f}, {high:+.3f}], {cost.mean():.2f} to {left.mean():.2f}")
     return bool(holds), "; ".join(words)
 
 
 @on("results/planner")
-def wide_plans_pay() -> tuple[bool, str]:
-    """The best of 64 plans, drawn wide apart and not, by the same seeds on the same resets of one learner's tiers."""
+def values_guide() -> tuple[bool, str]:
+    """Plans that values guide, too, beside those that danger alone guides, of the same runs on the same resets."""
     words, holds = [], True
     for task in planner_tables.SPREAD:
         task = f"simple_spread-{task}"
-        rows = planner_tables.rows_of("rows", task)
-        both = [planner_tables.played(rows, "icbf", way) for way in ("best of 64", "best of 64, spread 1")]
-        wide, near = (TASKS[task].normalised_return(x) for x in planner_tables.paired(*both))
-        low, high = mean_of_runs(wide - near)
-        holds = holds and low > 0 and max(r["cost_safe_start"] for r in both[0]) < 0.05
-        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(wide)} seeds")
+        (steered, cost), (plain, _) = (planned("rows", task, "icbf", way) for way in ("as it is", "danger alone"))
+        low, high = mean_of_runs(steered - plain)
+        printed = planner_tables.paper.PRINTED[task][1][2][0]
+        holds = holds and low > 0 and cost.mean() <= 0.05 and steered.mean() > printed and len(steered) >= 3
+        apart = f"{steered.mean():.2f} [{low:+.3f}, {high:+.3f}]"
+        words.append(f"{task} {apart} at {cost.mean():.3f}, {len(steered)} seeds")
     return bool(holds), "; ".join(words)
 
 
 @on("results/planner")
-def values_guide() -> tuple[bool, str]:
-    """Plans that values guide, and the same runs' without, on the same resets of Spread's tiers; and the cost of both
-    on a system whose danger the first step alone does not tell."""
-
-    def both(task: str) -> list[tuple[np.ndarray, np.ndarray]]:
-        return [planned("values", task, "icbf", way) for way in ("value guidance", "as it is")]
-
+def guided_elsewhere() -> tuple[bool, str]:
+    """Steps in contact on systems beside the paper's."""
     words, holds = [], True
-    for task in planner_tables.SPREAD:
-        task = f"simple_spread-{task}"
-        (steered, cost), (plain, _) = both(task)
-        low, high = mean_of_runs(steered - plain)
-        printed = planner_tables.paper.PRINTED[task][1][2][0]
-        holds = holds and low > 0 and cost.max() <= 0.05 and steered.mean() > printed and len(steered) >= 3
-        words.append(f"{task} {steered.mean():.2f} [{low:+.3f}, {high:+.3f}] at {cost.max()}, {len(steered)} seeds")
-    (_, left), (_, cost) = both("proving-hall")
-    return bool(holds and left.mean() < 0.1 * cost.mean()), "; ".join(words)
+    for task in planner_tables.PROVING:
+        (_, left), (_, cost) = (planned("rows", task, "icbf", way) for way in ("as it is", "alone"))
+        holds = holds and left.max() <= 0.03 and cost.min() >= 26
+        words.append(f"{task} {cost.mean():.1f} to {left.mean():.3f}, {len(left)} seeds")
+    return bool(holds), "; ".join(words)
 
 
 @on("results/planner")
@@ -860,9 +851,9 @@ def mean_plan_pays() -> tuple[bool, str]:
 
 @on("results/planner")
 def shaping_costs_return() -> tuple[bool, str]:
-    """Return of guided plans falls as λ rises."""
-    earned = [planned("rows", LEARNER, "icbf", "as it is")[0][0].mean()]
-    earned += [planned("frontier", LEARNER, f"λ = {w:g}", "as it is")[0].mean() for w in (0.3, 1.0, 3.0)]
+    """Return of plans that nothing guides falls as λ rises."""
+    earned = [planned("rows", LEARNER, "icbf", "alone")[0][0].mean()]
+    earned += [planned("frontier", LEARNER, f"λ = {w:g}", "alone")[0].mean() for w in (0.3, 1.0, 3.0)]
     return bool(np.all(np.diff(earned) < 0)), ", ".join(f"{x:.3f}" for x in earned)
 
 
@@ -904,9 +895,10 @@ def beside_print() -> dict[str, tuple[tuple[float, float], tuple[float, float]]]
 
 @on("results/planner")
 def print_earns_more() -> tuple[bool, str]:
-    """Of the paper's tasks, on other data: where its printed return is higher than ours."""
-    less = [task for task, (printed, ours) in beside_print().items() if printed[0] <= ours[0]]
-    return less == ["ant_4x2-poor"], f"not on {', '.join(less)}"
+    """Of the paper's tasks, on other data: where its printed return is not higher than ours."""
+    less = {task for task, (printed, ours) in beside_print().items() if printed[0] <= ours[0]}
+    spread = {f"simple_spread-{tier}" for tier in planner_tables.SPREAD}
+    return less == {"ant_4x2-medium"} | spread, f"not on {', '.join(sorted(less))}"
 
 
 @on("results/planner")
@@ -914,23 +906,23 @@ def some_exceed() -> tuple[bool, str]:
     """Robots' limits that plans exceed which are followed as they are, and those that print exceeds."""
     robots = {task: both for task, both in beside_print().items() if not task.startswith("simple")}
     ours, theirs = ([task for task, both in robots.items() if both[k][1] > 1] for k in (1, 0))
-    return sorted(ours) == ["ant_4x2-good", "halfcheetah_2x3-good"] and not theirs, f"ours {ours}, print {theirs}"
+    return ours == ["halfcheetah_2x3-good"] and not theirs, f"ours {ours}, print {theirs}"
 
 
 CLAIMS: dict[str, dict[str, Check]] = {
     "README.md": {
-        "It earns more than its logs": planner_reaches(LEARNER, 1.05, 0.1),
+        "It earns more than its logs": planner_reaches(LEARNER, 1.15, 0.1, seeds=4),
         "The safety comes from the guard": shielded_all,
         "On fourteen of sixteen systems a guarded clone never violates": of_again,
-        "Print earns more than ours as it is on twelve of thirteen tasks": print_earns_more,
-        "ours earns more on Simple Spread's four tiers at hardly any cost": values_guide,
-        "exceeds no limit; ours exceeds two": some_exceed,
+        "Print earns more than ours as it is on eight of nine robot tasks": print_earns_more,
+        "Ours earns more on Simple Spread's four tiers at hardly any cost": values_guide,
+        "exceeds no limit; ours exceeds one": some_exceed,
     },
     "docs/export.md": {"which is no slower": exported_in_time},
     "docs/ope.md": {"Danger is ranked well": danger_is_ranked},
     "docs/results.md": {
         # the paper
-        "Print earns more than ours as it is on twelve of thirteen tasks": print_earns_more,
+        "Print earns more than ours as it is on eight of nine robot tasks": print_earns_more,
         "Our ICBF as it is exceeds the limit": some_exceed,
         # Simple Spread
         "On Simple Spread a shield takes the cost from every proposal": shielded_all,
@@ -962,10 +954,10 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "yet a World of their logs leaves eight robots no contact": careful_logs_suffice,
         "takes more than half of the contact": of_other_integrators,
         # the planner
-        "which is what the paper prints": planner_reaches(FIVE, 1.1, 0.005),
-        "Guidance takes the cost and adds return": guidance_takes_cost,
-        "The best of many plans, drawn wide apart": wide_plans_pay,
+        "plans earn** 1.24 of the scale at no cost": planner_reaches(FIVE, 1.235, 0.005, seeds=3),
+        "Danger that guides takes the cost, and no return": guidance_takes_cost,
         "Values that guide plans earn more on every tier": values_guide,
+        "On two systems of the proving ground": guided_elsewhere,
         "Where values are climbed no difference was shown": same_from_plans,
         "plans earn more than clones in the mean of eight of nine robot data sets": plans_run,
         "On Crossing plans earn more than clones under the same shield": plans_cross,

@@ -40,23 +40,18 @@ ROBOTS = tuple(
 LEARNED = ("simple_spread-expert", "simple_spread-expert-pooled")  # one learner, five
 
 AS_IT_IS: dict[str, Any] = {}
-ALONE = {"barrier_guidance": 0.0}  # which is MADIFF, of the same training
+ALONE = {"barrier_guidance": 0.0, "value_guidance": 0.0}  # which is MADIFF, of the same training
 GUARDED = {guard: {"guard": guard, "anyway": True} for guard in ("shield", "full", "adapt")}
 COOL = {"planner": "low_temperature"}
 PLAYS: dict[str, dict[str, Any]] = {
     "as it is": AS_IT_IS,
     "alone": ALONE,
-    "best of 8": {"guard": "select", "num_samples": 8},
-    "best of 64": {"guard": "select", "num_samples": 64},
-    "best of 64, alone": {"guard": "select", "num_samples": 64} | ALONE,
-    **{f"best of {n}, spread {x}": {"guard": "select", "num_samples": n, "spread": x} for n in (8, 64) for x in (1, 5)},
-    "value guidance": {"planner": "value_guided"},
+    "danger alone": {"value_guidance": 0.0},
     **{f"under {guard}": how for guard, how in GUARDED.items()},
     "cool": COOL,
     "cool, alone": COOL | ALONE,
     "cool, under adapt": COOL | GUARDED["adapt"],
-    "cool, value guidance": COOL | {"value_guidance": 0.5},
-    "cool, best of 8, under adapt": COOL | GUARDED["adapt"] | {"num_samples": 8, "select": True},
+    "cool, values guide": COOL | {"value_guidance": 1.0},  # as it is where V knows how to stay safe
     **{f"{n} steps": {"sampling_steps": n} for n in (1, 2, 3, 10, 20)},
     **{f"temperature {t:g}": {"temperature": t} for t in (0.0, 0.3)},
 }
@@ -100,14 +95,9 @@ ABLATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
 SHAPED = {f"λ = {w:g}": ("icbf", "", {"barrier_weight": w}) for w in (0.1, 0.3, 1.0, 3.0)}
 GROUPS: dict[str, dict[str, Any]] = {
     "rows": {
-        "tasks": SPREAD + POOLED,
+        "tasks": SPREAD + POOLED + ("proving-hall", "proving-discs"),
         "rows": {"icbf": ("icbf", "", {})},
-        "plays": ("as it is", "alone", "best of 8", "best of 64"),
-    },
-    "values": {
-        "tasks": SPREAD + POOLED + ("crossing-hasty", "proving-hall", "proving-discs"),
-        "rows": {"icbf": ("icbf", "", {})},
-        "plays": ("as it is", "value guidance"),
+        "plays": ("as it is", "danger alone", "alone"),
     },
     "ablations": {"tasks": LEARNED, "rows": ABLATIONS, "plays": ("alone",)},
     "frontier": {"tasks": LEARNED, "rows": SHAPED, "plays": ("as it is", "alone")},
@@ -129,12 +119,12 @@ GROUPS: dict[str, dict[str, Any]] = {
     "robots": {
         "tasks": ROBOTS,
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("cool", "cool, under adapt"),
+        "plays": ("cool", "cool, values guide", "cool, alone", "cool, under adapt"),
     },
     "crossing": {
         "tasks": ("crossing-hasty",),
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("as it is", "alone", "under shield"),
+        "plays": ("as it is", "danger alone", "alone", "under shield"),
     },
 }
 
@@ -203,7 +193,6 @@ def played(run: Any, task: Task, options: dict[str, Any]) -> dict[str, Any]:
         "cost": round(r["cost_mean"], 4),
         "cost_safe_start": round(r["cost_safe_start"], 4),
         "violation_rate": round(r["violation_rate"], 4),
-        "guided": r["guided"],
         "wall_seconds": round(time.monotonic() - begun, 1),
         "per_episode": {
             "return": np.round(of["return"], 2).tolist(),

@@ -16,6 +16,7 @@ from ringfence.evaluation.statistics import mean_of_runs
 
 PAGE = "docs/results.md"
 SPREAD = ("expert", "medium-replay", "medium", "random")
+PROVING = ("proving-hall", "proving-discs")
 Rows = list[dict[str, Any]]
 
 
@@ -63,24 +64,22 @@ def less(found: Rows, others: Rows, task: str) -> str:
 
 # Ways of playing the same runs. `icbf` without guidance is `madiff`.
 WAYS = {
-    "alone": "without guidance (`madiff`)",
-    "as it is": "`icbf`, as it is",
-    "best of 64": "the best of 64",
+    "alone": "nothing guides (`madiff`)",
+    "danger alone": "danger alone guides",
+    "as it is": "`icbf`: values guide, too",
 }
 
 
 def spread() -> str:
     """A line for each task, a column for each way of playing the same runs."""
     lines = []
-    for task in (f"simple_spread-{tier}{pool}" for pool in ("", "-pooled") for tier in SPREAD):
+    for task in (*(f"simple_spread-{tier}{pool}" for pool in ("", "-pooled") for tier in SPREAD), *PROVING):
         rows = rows_of("rows", task)
         if rows:
             logs = json.loads((RESULTS / "planner" / f"rows-{task}.json").read_text())["logs"]
             cells = [brief(played(rows, "icbf", way)) for way in WAYS]
-            cells.insert(2, brief(played(rows_of("values", task), "icbf", "value guidance")))
             lines.append((task.removeprefix("simple_spread-"), f"{logs:.2f}", *cells))
-    alone, guided, *best = WAYS.values()
-    return markdown(("logs", "they earn", alone, guided, "values guide, too", *best), lines)
+    return markdown(("logs", "they earn", *WAYS.values()), lines)
 
 
 LEARNED = ("simple_spread-expert", "simple_spread-expert-pooled")
@@ -134,7 +133,6 @@ def glance() -> str:
         "*the paper prints*",
         "Algorithm 1 as printed",
         "ICBF as it is",
-        "ICBF, values guide",
         "ICBF, shield",
         "ICBF, `full`",
         "BC, shield",
@@ -156,7 +154,6 @@ def glance() -> str:
             guarded = rows_of("guards", task)
             cells.append(brief([r for r in algorithm1 if r["name"] == best]))
             cells.append(brief(played(rows_of("rows", task), "icbf", "as it is")))
-            cells.append(brief(played(rows_of("values", task), "icbf", "value guidance")))
             cells += [brief(played(guarded, "icbf", f"under {guard}")) for guard in ("shield", "full")]
             clones = sums_of("guards", task, ("bc", "default+shield-learned"))
             cells.append(clones if clones != "–" else pooled_row(task, "bc, 20,000 updates, under shield"))
@@ -165,9 +162,7 @@ def glance() -> str:
         else:
             rows = rows_of("robots", task)
             cells.append(robot(played(rows_of("algorithm1", task), "λ = 1", "cool"), task))
-            of_values = robot(played(rows_of("values", task), "icbf", "cool, value guidance"), task)
-            plain, guarded = (robot(played(rows, "icbf", way), task) for way in ("cool", "cool, under adapt"))
-            cells += [plain, of_values, guarded, "–"]
+            cells += [robot(played(rows, "icbf", way), task) for way in ("cool", "cool, under adapt")] + ["–"]
             cells.append(sums_of("guards-mujoco", task, ("bc", "default+adapt-learned")))
             cells.append(sums_of("mujoco", task, ("behaviour data", "reference")))
         lines.append(cells)

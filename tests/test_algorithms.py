@@ -22,7 +22,8 @@ from ringfence.loading.resolve import load
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import draw
-from ringfence.proposals.guidance import AHEAD_ROWS, climbed, worth
+from ringfence.proposals import guidance
+from ringfence.proposals.guidance import FAR, ROWS, Way, climb, guided_by
 from ringfence.proposals.options import WIDE
 from ringfence.training import loop
 from ringfence.training.job import make_job
@@ -234,36 +235,41 @@ def test_several_plans_are_drawn_ever_farther_apart(trained, small_store):
     assert load(trained["icbf"])[1].options.spread == WIDE
 
 
-def test_values_steer_what_is_drawn(trained, small_store, small_world):
+def test_values_steer_what_is_drawn(trained, small_store, small_world, monkeypatch):
     """Actions that climb are worth more by what the World foresees, and plans that are steered are others."""
-    policy = load(trained["icbf"], world=small_world, value_guidance=0.5, barrier_guidance=1.0, anyway=True)[1]
+    policy = load(trained["icbf"], world=small_world, value_guidance=1.0, anyway=True)[1]
+    assert guided_by(policy) == {"guided_by_values": 1.0, "guided_by_danger": 10.0}
     seen, state = jnp.asarray(small_store.observations[:8]), jnp.asarray(small_store.state[:8])
-    judged = policy.world.map(seen, state)
-    worth_of = lambda actions: worth(policy, judged, actions)  # noqa: E731
-    actions = jnp.zeros((8, AHEAD_ROWS, 3, 2))
-    assert worth_of(climbed(lambda x: x, worth_of, actions, 0.01, 3)) > worth_of(actions) + 0.01
+    judged = policy.guide.world.map(seen, state)
+    actions = jnp.zeros((8, ROWS, 3, 2))
+    way = Way(lambda x: x, lambda _, row: row, actions[:, 0], False)
+    worth = lambda actions: policy.guide.worth(judged, way, actions, 0.0 * actions)[0].sum()  # noqa: E731
+    with monkeypatch.context() as m:
+        m.setattr(guidance, "FAR", 0.01)
+        assert worth(policy.guide.moved(judged, way, actions, 3)) > worth(actions) + 0.01
     first = [policy.act(policy.initial_state(8), seen, state, jax.random.key(0))[1].action]
-    unsteered = dataclasses.replace(policy, options=dataclasses.replace(policy.options, value_guidance=0.0))
+    unsteered = dataclasses.replace(policy, guide=None)
     first.append(unsteered.act(unsteered.initial_state(8), seen, state, jax.random.key(0))[1].action)
     assert jnp.isfinite(first[0]).all() and jnp.abs(first[0] - first[1]).max() > 0.05
     with pytest.raises(UserError, match="worse than by their mean, and these options climb them"):
-        load(trained["icbf"], planner="value_guided")
+        load(trained["icbf"], value_guidance=1.0)
+    alone = load(trained["icbf"])[1]
+    assert guided_by(alone) == {"guided_by_values": 0.0, "guided_by_danger": 10.0}, "danger alone, by itself"
 
 
 def test_what_is_climbed_moves_actions_by_what_is_asked_and_stays_in_bounds():
-    x = jnp.array([[0.0, 0.3], [0.0, 0.0]])
-    double = lambda x: (2.0 * x).reshape(2, 1, 1, 2)  # noqa: E731
-    uphill = lambda a: (a * jnp.array([4.0, 3.0])).sum()  # noqa: E731
-    moved = double(climbed(double, uphill, x, 0.5, 1))[:, 0, 0]
-    np.testing.assert_allclose(moved[1], [0.4, 0.3], atol=1e-6)
-    assert (double(climbed(double, uphill, x, 0.5, 50)) <= 1.0 + 1e-6).all()
-    np.testing.assert_array_equal(climbed(double, lambda a: 0.0 * a.sum(), x, 0.5, 3), x)
+    actions = jnp.array([[0.0, 0.9], [0.0, 0.0]]).reshape(2, 1, 1, 2)
+    up = jnp.broadcast_to(jnp.array([4.0, 3.0]), actions.shape)
+    worth = jnp.array([-1.0, -2.5])
+    np.testing.assert_allclose(climb(actions, worth, up, FAR)[:, 0, 0], [[0.4, 0.1], [0.4, 0.3]], atol=1e-6)
+    np.testing.assert_allclose((climb(actions, worth, up, None) * up)[1].sum(), 2.5, atol=1e-5)
+    np.testing.assert_array_equal(climb(actions, worth, 0.0 * up, FAR), 0.0 * up)
 
 
 def test_a_controller_acts_like_the_policy(trained, small_store):
-    how = dict(planner="value_guided", guard="select", sampling_steps=2, num_samples=2, correction_steps=1, anyway=True)
+    how = dict(planner="published", guard="select", sampling_steps=2, num_samples=2, correction_steps=1, anyway=True)
     pilot = Controller(trained["icbf"], **how)
-    assert pilot.policy.proposal.options.value_guidance == 0.5 and pilot.policy.guard.options.num_samples == 2
+    assert pilot.policy.proposal.options.temperature == 0.5 and pilot.policy.guard.options.num_samples == 2
     seen, state = small_store.observations[0], small_store.state[0]
     first = pilot.act(seen, state)
     assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["ood"].dtype == bool
@@ -668,7 +674,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--set", "planner=value_guided"], "write --planner value_guided"),
+        (["--set", "planner=low_temperature"], "write --planner low_temperature"),
         (["--set", "checkpoint=12"], "write --checkpoint 12"),
         (["--set", "quiet=1"], "Unknown option of planner or guard 'quiet'"),
         (

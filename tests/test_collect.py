@@ -262,6 +262,35 @@ def test_what_cannot_be_compared_is_not_believed(tmp_path):
         ringfence.collect(Drift, lambda observations: next(endless), episodes=2, out=tmp_path / "d.h5")
 
 
+class Drawing:
+    """A policy that draws by itself, anew from its seed at every reset if it is asked to."""
+
+    def __init__(self, seed):
+        self.seed = seed
+        self.reset()
+
+    def reset(self):
+        self.chance = np.random.default_rng(self.seed)
+
+    def act(self, observations):
+        return self.chance.uniform(-1, 1, (2, 1))
+
+
+def test_draws_of_a_policys_own_are_compared(tmp_path):
+    def drawing(seed):
+        chance = np.random.default_rng(seed)
+        return lambda observations: chance.uniform(-1, 1, (2, 1))
+
+    first = ringfence.collect(Drift, Drawing(0), episodes=2, out=tmp_path / "d.h5")
+    again = ringfence.collect(Drift, Drawing(0), episodes=2, out=tmp_path / "d.h5")
+    assert again.content == first.content
+    with pytest.raises(StoreError, match="of a policy whose code or values differ"):
+        ringfence.collect(Drift, Drawing(1), episodes=2, out=tmp_path / "d.h5")
+    ringfence.collect(Drift, drawing(0), episodes=2, out=tmp_path / "e.h5")
+    with pytest.raises(StoreError, match="since a policy with a numpy.random.* cannot be compared"):
+        ringfence.collect(Drift, drawing(1), episodes=2, out=tmp_path / "e.h5")
+
+
 def test_another_card_or_end_is_another_recording(tmp_path):
     first = {"task": "drift", "dt": 0.1}
     ringfence.collect(Drift, episodes=2, out=tmp_path / "d.h5", card=first)

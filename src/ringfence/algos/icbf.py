@@ -7,7 +7,7 @@ Losses, each with the paper's symbol:
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
     L^E, L^Q  who drives; a plan is of one driver                                             (algos/drivers.py)
 
-By default λ = 0, and the barrier guides the sampling instead (proposals/guidance.py). With `barrier = False` there is
+By default λ = 0, and a World guides the sampling instead (proposals/guidance.py). With `barrier = False` there is
 no barrier at all, and the method is MADIFF (Zhu et al. 2024).
 """
 
@@ -76,7 +76,7 @@ class Config:
 
     # --- barrier ---
     barrier: bool = True  # L^C and guidance at all
-    guided: bool = True  # a World's barrier guides the sampling, unless it is played otherwise; of `split`
+    guided: bool = True  # a World guides the sampling, unless it is played otherwise; of `split`
     barrier_weight: NonNegative = 0.0  # λ of the generator's share of L^C
     barrier_start: Share = 0.3  # share of training at which λ starts to rise from 0
     barrier_full: Share = 0.5  # share of training at which λ is reached
@@ -114,7 +114,7 @@ class Config:
 
     @property
     def guides(self) -> bool:
-        """Whether a World's barrier guides the sampling where nothing else is asked for."""
+        """Whether a World guides the sampling where nothing else is asked for."""
         return self.guided and self.barrier and self.routing == "split"
 
     @property

@@ -172,8 +172,9 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     wanted = dataclasses.asdict(plan)
     if stored["options"]:
         played = {**usual, **stored["options"]}
-        either = {"barrier_guidance": wanted["barrier_guidance"] or 0.0}  # 0 before it could be the method's own
-        if played | {"barrier_guidance": played["barrier_guidance"] or 0.0} != wanted | either:
+        weights = ("barrier_guidance", "value_guidance")  # 0 before they could be the method's own
+        played, wanted = ({**x, **{name: x[name] or 0.0 for name in weights}} for x in (played, wanted))
+        if played != wanted:
             return False
     guard = stored.get("guard_options") or {}
     if not spec.guarded:

@@ -27,6 +27,8 @@ ARCHIVES = {
     "curves.tar.xz": ("metrics.jsonl",),
 }
 LARGEST = 2**29  # bytes of an archive, unpacked
+RATIO = 400  # times its size that an archive holds at most; ours hold 5 to 33 times theirs
+PIECE = 2**20  # bytes that are unpacked at a time
 MANY = 20_000  # files in an archive; the largest of ours holds 2,700
 LONGEST = 200  # bytes of a name in a path: `whole` adds some of its own to them
 MARK = Path("cells", ".unpacked.json")  # digests of the archives whose files are loose
@@ -53,40 +55,60 @@ def unpack(out: str | Path) -> None:
             return
     for archive in archives:
         with reading(archive, "archive of results", "restore that file", UserError):
-            with tarfile.open(fileobj=io.BytesIO(_content(archive))) as tar:
-                for number, member in enumerate(tar):
-                    if number >= MANY:
-                        raise ValueError(f"it holds more than {MANY:,} files")
-                    _place(out, archive, member, tar)
+            with tarfile.open(fileobj=_content(archive)) as tar:
+                for member, file in _checked(out, archive, tar):
+                    _place(file, member, tar)
     write_json(out / MARK, digests)
 
 
-def _content(archive: Path) -> bytes:
+def _content(archive: Path) -> io.BytesIO:
     """The whole of it, so that its checksum is read, and no more than anybody packs."""
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ)
-    content = unpacker.decompress(archive.read_bytes(), max_length=LARGEST)
+    packed = archive.read_bytes()
+    most = min(LARGEST, RATIO * len(packed) + PIECE)
+    content = io.BytesIO()
+    piece = unpacker.decompress(packed, PIECE)
+    while piece or not (unpacker.eof or unpacker.needs_input):
+        if content.write(piece) and content.tell() > most:
+            raise EOFError(f"it holds more than {most / 2**20:.0f} MiB")
+        piece = b"" if unpacker.eof else unpacker.decompress(b"", PIECE)
     if not unpacker.eof:
-        raise EOFError(f"its end is missing, or it holds more than {LARGEST / 2**20:.0f} MiB")
+        raise EOFError("its end is missing")
+    if content.getbuffer()[-2 * tarfile.BLOCKSIZE :].tobytes().strip(b"\0"):
+        raise EOFError("the end of what it holds is missing")
+    content.seek(0)
     return content
 
 
-def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFile) -> None:
+def _checked(out: Path, archive: Path, tar: tarfile.TarFile) -> list[tuple[tarfile.TarInfo, Path]]:
+    """The files of an archive and where each is to stand, before any is written."""
+    found: dict[Path, tarfile.TarInfo] = {}
+    for number, member in enumerate(tar):
+        if number >= MANY:
+            raise ValueError(f"it holds more than {MANY:,} files")
+        parts = PurePosixPath(member.name).parts
+        known = parts and parts[0] in PLACES and ".." not in parts and parts[-1] in ARCHIVES[archive.name]
+        short = all(len(part.encode(errors="replace")) <= LONGEST for part in parts)
+        short = short and len(member.name) <= 10 * LONGEST
+        file = out.joinpath(*parts)
+        inside = any(parent in found for parent in file.parents)
+        if not (known and short and member.isreg()) or member.issparse() or inside:  # a sparse one claims any size
+            raise UserError(f"'{archive}' holds '{member.name}', which is no file of a cell; restore that archive.")
+        try:
+            within(out, file)
+        except ValueError as error:
+            raise UserError(f"'{file}' cannot be written ({error}); remove that link.") from None
+        found[file] = member
+    return [(member, file) for file, member in found.items()]
+
+
+def _place(file: Path, member: tarfile.TarInfo, tar: tarfile.TarFile) -> None:
     """One file of an archive, where there is none yet; results join those that are there."""
-    parts = PurePosixPath(member.name).parts
-    known = parts and parts[0] in PLACES and ".." not in parts and parts[-1] in ARCHIVES[archive.name]
-    short = all(len(part.encode(errors="replace")) <= LONGEST for part in parts) and len(member.name) <= 10 * LONGEST
-    if not (known and short and member.isreg()) or member.issparse():  # a sparse one claims any size in a few bytes
-        raise UserError(f"'{archive}' holds '{member.name}', which is no file of a cell; restore that archive.")
-    file = out.joinpath(*parts)
-    try:
-        within(out, file)
-    except ValueError as error:
-        raise UserError(f"'{file}' cannot be written ({error}); remove that link.") from None
     packed = tar.extractfile(member)
     assert packed is not None  # it is a file
     content = packed.read()
     if file.exists():
-        if parts[-1] != "results.json":
+        if file.name != "results.json":
             return
         results = schemas.read(file, schemas.Results, "holds a damaged results.json; delete that file")
         content = json.dumps({**schemas.decode(content, schemas.Results), **results}, indent=1).encode()

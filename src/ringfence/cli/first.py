@@ -102,8 +102,6 @@ def demonstrate(folder: Path, tier: str = "expert", quick: bool = False) -> Path
     rows["BC, shielded, learned"] = evaluate(cloned, guard="shield", world=world, **learned, **protocol)
     rows["MADIFF"] = evaluate(planner, barrier_guidance=0.0, **protocol, **fewer)
     rows["ICBF"] = evaluate(planner, anyway=quick, **protocol, **fewer)
-    steered = {"planner": "value_guided", "anyway": quick}
-    rows["ICBF, values guide, too"] = evaluate(planner, **steered, **protocol, **fewer)
     rounds: dict[str, Any] = {"optimizer_steps": 2} if quick else {}
     rows["BC, full guard, learned"] = evaluate(cloned, guard="full", world=world, **learned, **protocol, **rounds)
     table = Table(

@@ -46,9 +46,8 @@ class Playing:
     """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
     anyway: bool = False
     """guard by a World whose verdict is unfit, too."""
-    planner: Literal["default", "value_guided", "low_temperature", "published"] = "default"
-    """how diffusion planners draw plans: value_guided lets value steer them, low_temperature is for robots, published
-    is MADIFF's (preset raw-return)."""
+    planner: Literal["default", "low_temperature", "published"] = "default"
+    """how diffusion planners draw plans: low_temperature is for robots, published is MADIFF's (preset raw-return)."""
     num_samples: int | None = None
     """proposals that the guard asks for."""
     margin: float | None = None
@@ -68,7 +67,7 @@ class Playing:
     replan: int | None = None
     """steps for which a plan is followed."""
     set: Assignments = field(default_factory=list)
-    """any other option of planner or guard, e.g. --set correction_steps=20 value_guidance=10; docs/options.md lists
+    """any other option of planner or guard, e.g. --set correction_steps=20 value_guidance=0; docs/options.md lists
     them."""
 
     def arguments(self) -> dict[str, Any]:

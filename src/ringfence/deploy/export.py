@@ -43,7 +43,7 @@ from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem.bounds import stored
 from ringfence.problem.homogeneous import agent_policy
-from ringfence.proposals.guidance import TakesGuidance
+from ringfence.proposals.guidance import TakesGuidance, guided_by
 from ringfence.training import worlds
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
@@ -110,7 +110,7 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
     job = resolved.job
     guard = resolved.guard
     plan_options = resolved.plan_options
-    guiding = resolved.proposal.world if isinstance(resolved.proposal, TakesGuidance) else None
+    guide = resolved.proposal.guide if isinstance(resolved.proposal, TakesGuidance) else None
     config = spec.run.config
     data = config["data"]
     width, state_width = job.widths
@@ -129,12 +129,12 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
         "seed": config["seed"],
         "provenance": data["provenance"],
         "planner_options": dataclasses.asdict(plan_options) if plan_options else {},
-        "guided": float(getattr(resolved.proposal, "guidance", 0.0)),
+        **guided_by(resolved.proposal),
         "guard_options": dataclasses.asdict(guard.options) if guard else {},
         "barrier": spec.barrier if guard else "none",
         "execution": worlds.execution_of(job.task, "decentralized" if guard and guard.world.alone else None),
         "world": digest(guard.world) if guard else None,
-        "guiding_world": None if guiding is None else digest(guiding),
+        "guiding_world": None if guide is None else digest(guide.world),
         "n_agents": job.team,
         "names": {k: list(x) for k, (x, count) in names.items() if x is not None and len(x) == count},
         "constraints": constraints_of(resolved.team),

@@ -14,6 +14,7 @@ from ringfence.evaluation import recordings
 from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
+from ringfence.proposals.guidance import guided_by
 from ringfence.training import worlds
 from ringfence.training.runs import Run
 from ringfence.utils.compilation import keep_programs
@@ -101,7 +102,7 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "provenance": run.config["data"]["provenance"],
         "planner": spec.planner,
         "options": {} if options is None else dataclasses.asdict(options),
-        "guided": float(getattr(resolved.proposal, "guidance", 0.0)),
+        **guided_by(resolved.proposal),
         "guard": "none" if guard is None else spec.guard,
         "barrier": "none" if guard is None else spec.barrier,
         "execution": worlds.execution_of(resolved.job.task, spec.execution),

@@ -13,14 +13,14 @@ from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown
-from ringfence.guards import Guard, Guarded, options_of
+from ringfence.guards import Guard, Guarded
 from ringfence.guards.policy import build
 from ringfence.loading import oracle
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
 from ringfence.problem.origins import Origins
-from ringfence.proposals.guidance import WHOLE, TakesGuidance, guided
+from ringfence.proposals.guidance import DANGER, VALUES, TakesGuidance, guided, knows_ahead
 from ringfence.proposals.options import PLANNERS, PlanOptions, TakesPlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
@@ -140,42 +140,41 @@ def resolve(spec: PolicySpec) -> Resolved:
 
 
 def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:
-    """A policy whose sampling is guided by the World that its training read, or else would guard it: by danger and by
-    values as asked for, and where a method follows a barrier by itself, if that World is fit to."""
-    asked = policy.options.barrier_guidance
-    corrected = spec.guarded and options_of(spec.guard, spec.barrier, {}, **dict(spec.guard_options)).get(
-        "correction_steps", 0
-    )
-    if asked and corrected:
-        raise UserError(
-            "barrier_guidance is for actions that are followed as they are drawn, and a guard corrects them anyway; "
-            "give one of the two."
-        )
-    alone = policy.options.execution == "decentralized"  # a World sees the whole team
-    follows = policy.options.replan > 1  # and so steps that nothing guided
-    by_itself = asked is None and getattr(job.config, "guides", False) and not (corrected or alone or follows)
-    climbs = policy.options.value_guidance > 0
-    if not (asked or by_itself or climbs):
+    """A policy whose sampling is guided by the World that its training read, or else would guard it: by values and
+    danger as asked for, and by both where a method follows a World by itself, no guard decides, and that World is fit
+    to."""
+    o = policy.options
+    values, danger = o.value_guidance, o.barrier_guidance
+    asked = bool(values or danger)
+    alone = o.execution == "decentralized"  # a World sees the whole team
+    by_itself = getattr(job.config, "guides", False) and not (spec.guarded or alone)
+    if danger is None:
+        danger = DANGER if by_itself or values else 0.0
+    if values is None:
+        values = VALUES if by_itself and danger else 0.0
+    if not (values or danger):
         return policy
-    world = read
-    if (asked or climbs) and (read is None or spec.world is not None):
-        world = worlds.for_guard(run, None, spec.world, read=read)
-    if world is None or (world.barrier is None and not (asked or climbs)):
+    world = worlds.for_guard(run, None, spec.world, read=read) if asked and (read is None or spec.world) else read
+    if world is None or (world.barrier is None and not asked):
         return policy
     _check_width(job, world.map, "The World")
-    knows_danger = world.barrier is not None
-    if climbs:
-        require_values(world.card, spec.anyway)
-    if asked or (climbs and knows_danger):
-        require(world.card, spec.anyway)
-    elif not climbs and (world.card.verdict or judge(world.card)).word == "unfit" and not spec.anyway:
+    card = world.card
+    if not (asked or spec.anyway) and (card.verdict or judge(card)).word == "unfit":
         _log.warning(
             f"The World of '{run.path}' is unfit to guide by, so plans are drawn without it; insist with anyway=True, "
             "or set barrier_guidance=0."
         )
         return policy
-    of_itself = WHOLE if by_itself and knows_danger else 0.0
-    return guided(policy, world, of_itself if asked is None else asked)
+    if world.barrier is None and o.barrier_guidance is None:
+        danger = 0.0
+    if danger:
+        require(card, spec.anyway)
+    misleads = card.values is not None and card.values.misleads and not spec.anyway
+    if o.value_guidance is None and (misleads or not knows_ahead(world)):
+        values = 0.0
+    if values:
+        require_values(card, spec.anyway)
+    return guided(policy, world, values, danger)
 
 
 def load_job(run: Run, agents: int | None = None) -> Job:

@@ -94,7 +94,8 @@ class PolicySpec:
             anyway=anyway,
         )
         if not spec.guarded:
-            for name, given in (("barrier", barrier), ("world", None if options.get("barrier_guidance") else world)):
+            guides = options.get("value_guidance") or options.get("barrier_guidance")
+            for name, given in (("barrier", barrier), ("world", None if guides else world)):
                 if given is not None:
                     raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
         return spec

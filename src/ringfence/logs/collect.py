@@ -22,7 +22,7 @@ from ringfence.problem.bounds import Bounds
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.utils import interrupts
 from ringfence.utils.files import writable
-from ringfence.utils.functions import content_of, of_both
+from ringfence.utils.functions import Streams, content_of, of_both
 from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
 
@@ -76,7 +76,10 @@ def collect(
         "policy": player.name,
         "first_seed": seed,
         "early_ends": early_ends,
-        "made_of": {name: content_of(part) for name, part in made_of.items()},
+        "made_of": {
+            name: content_of(part, _streams(policy) if name == "policy" else "by kind")
+            for name, part in made_of.items()
+        },
     }
     kept = _kept_before(file, source, episodes)
     if kept is not None and _begun(kept) >= episodes:
@@ -274,6 +277,12 @@ def _played(env: SideBySide, player: _Player, space: _Space, first_seed: int, k:
     )
 
 
+def _streams(policy: Any) -> Streams:
+    """How random streams of a policy's own are compared: where they stand once it is reset. Without a reset nobody
+    knows where they stood, and going on might draw the same again."""
+    return "by state" if hasattr(policy, "reset") else "as unknown"
+
+
 def _called(env: Any) -> str:
     """The name of a simulator: its class's, or what is within a wrapper of PettingZoo's calls itself."""
     own = getattr(env, "metadata", None) or {}
@@ -370,12 +379,12 @@ def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> Ep
         if " " in content:
             raise StoreError(
                 f"'{file}' may hold another recording, since a {part} with a {content.split()[1]} cannot be compared; "
-                "delete it or name another file."
+                "delete it or name another file, or let an attribute made_of tell what it is."
             )
         if kept.get(part) == source.get(part) and isinstance(made_of, dict) and made_of.get(part) != content:
             raise StoreError(
                 f"'{file}' holds another recording, of a {part} whose code or values differ; delete it or name another "
-                "file."
+                "file, or let an attribute made_of tell what it is, where it holds what changes (a time, say)."
             )
     if kept != source:
         raise StoreError(

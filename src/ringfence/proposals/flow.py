@@ -3,7 +3,7 @@
 noise ε (N·A) ──┐
 state, driver ──┼─► clean action â(a_τ, τ)   a_τ+Δ = a_τ + Δ (â − a_τ)/(1 − τ)    τ = 0 .. 1 in 1 to 4 steps
 
-With `barrier_guidance` w, every step moves â by w of a step to where a World's danger keeps its margin (guidance.py).
+With `barrier_guidance` every step moves â to where a World's danger keeps its margin (guidance.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.base import from_unit, rolled
 from ringfence.proposals.drivers import asked, classifier_free, draw, several
-from ringfence.proposals.guidance import cleared, lacking
+from ringfence.proposals.guidance import Guide, Way
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
@@ -51,9 +51,7 @@ class FlowPolicy(eqx.Module):
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
-    world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
-    guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
-    ahead: bool = eqx.field(static=True, default=True)  # and by V, too
+    guide: Guide | None = None  # of the sampling, where `barrier_guidance` asks for it
 
     def __check_init__(self):
         usual = PlanOptions()
@@ -77,7 +75,7 @@ class FlowPolicy(eqx.Module):
         """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds."""
         x = self.feature_map(observations, state)
         carry, key = self._with_driver(carry, x, key)
-        present = None if self.world is None else self.world.map(observations, state)
+        present = None if self.guide is None else self.guide.world.map(observations, state)
         action = self.draw(x, carry["driver"], key, present)
         return carry, PolicyStep(from_unit(action, self.spec), {})
 
@@ -93,7 +91,7 @@ class FlowPolicy(eqx.Module):
             carry["driver"], count, lambda more: self._drawn(jnp.repeat(x, more, 0), jax.random.fold_in(key, 1))
         )
 
-        guides = None if self.world is None else jnp.repeat(self.world.map(observations, state), count, 0)
+        guides = None if self.guide is None else jnp.repeat(self.guide.world.map(observations, state), count, 0)
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
         temperatures = jnp.tile(self.options.temperatures(count), batch)
 
@@ -120,23 +118,18 @@ class FlowPolicy(eqx.Module):
 
             return self._guided(answer, batch)
 
+        def joint(action: Array) -> Array:
+            return s.own(jnp.clip(action, -1.0, 1.0).reshape(batch, s.n_agents, s.action_dim))
+
         heat = o.temperature if temperature is None else temperature[:, None]
         action = heat * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
         for k in range(o.sampling_steps):
             aim = clean(action, jnp.full(batch, k / o.sampling_steps))
-            if present is not None:
-                aim = self._clear(present, aim)
+            if present is not None and self.guide is not None:
+                way = Way(lambda aim: aim[:, None], lambda _, aim: joint(aim), aim, False)
+                aim = self.guide.moved(present, way, aim, 1)
             action = action + (aim - action) / (o.sampling_steps - k)
-        return s.own(jnp.clip(action, -1.0, 1.0).reshape(batch, s.n_agents, s.action_dim))
-
-    def _clear(self, present: Array, action: Array) -> Array:
-        """Joint actions (B, N·A), moved towards those after which danger keeps its margin."""
-        s = self.spec
-
-        def missing(action: Array) -> Array:
-            return lacking(self, present, s.own(jnp.clip(action, -1.0, 1.0).reshape(-1, s.n_agents, s.action_dim)))
-
-        return cleared(missing, action, self.guidance)
+        return joint(action)
 
     def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
         """What answers to (y, whether it is given), guided by the return that is asked for, if training knew any."""

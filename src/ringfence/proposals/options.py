@@ -21,12 +21,12 @@ class PlanOptions:
     target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %; of the largest, if raw
     temperature: NonNegative = 1.0  # scale of the first noise
     spread: NonNegative = 1.0  # by which it is multiplied for the last of several plans that are drawn together
-    # how far actions, in [−1, 1], move up a World's values in each of six rounds of every sampling step; 0: none
-    value_guidance: NonNegative = 0.0
-    reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
-    # share of a step to the World's margin, in every sampling step; 0: none; None: as the method has it (icbf: 1), and
-    # none under a guard that corrects actions anyway
+    # what guidance by a World weighs what is earned with, in deviations of the logs' returns, and danger, in calibrated
+    # margins; 0: not at all. None: 1 and 10 of a method that follows a World (icbf) where no guard decides, else 0; 10
+    # where values are climbed.
+    value_guidance: NonNegative | None = None
     barrier_guidance: NonNegative | None = None
+    reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     replan: AtLeastOne = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
@@ -65,11 +65,8 @@ DEFAULT = "default"
 # Named sets of evaluation-time choices, made on validation resets; docs/options.md.
 PLANNERS: dict[str, dict] = {
     DEFAULT: {},
-    # A World's values steer the samples.
-    "value_guided": {"value_guidance": 0.5},
     # MADIFF at inference (Zhu et al. 2024), for runs whose condition is `raw`.
     "published": {"temperature": 0.5},
-    # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no
-    # gradient on value, which rises with the very speed that is limited.
+    # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off.
     "low_temperature": {"temperature": 0.3, "spread": 1.0},
 }

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -29,13 +28,12 @@ from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
 from ringfence.proposals.drivers import classifier_free, draw, several
-from ringfence.proposals.guidance import AHEAD_ROWS, cleared, climbed, lacking, worth
+from ringfence.proposals.guidance import ROWS, Guide, Way
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
 
-ROUNDS = 2  # of guidance in every sampling step: one leaves a tenth of a collision an episode, three do no better
-CLIMBS = 6  # rounds of value guidance in every sampling step
+ROUNDS = 6  # of guidance in every sampling step: three earn less (results/tuning/value_guidance.csv)
 
 
 class Planner(eqx.Module):
@@ -55,9 +53,7 @@ class Planner(eqx.Module):
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
-    world: World | None = None  # that guides the sampling, by its danger or its values
-    guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step away from danger
-    ahead: bool = eqx.field(static=True, default=True)  # and by V, too
+    guide: Guide | None = None  # of the sampling
 
     @property
     def rows_planned(self) -> int:
@@ -78,11 +74,6 @@ class Planner(eqx.Module):
                     f"{name}={getattr(o, name)} asks a World that sees the whole team, which "
                     "execution='decentralized' does not; leave one of them out."
                 )
-        if o.barrier_guidance and o.replan > 1:
-            raise UserError(
-                f"barrier_guidance={o.barrier_guidance} guides the first step of a plan, and replan={o.replan} follows "
-                "more of them; leave one of them out."
-            )
         if o.execution == "decentralized" and self.observe == "all":
             raise UserError("execution='decentralized' needs a model trained with observe='single' or 'mixed'.")
         if o.execution == "centralized" and self.observe == "single":
@@ -146,7 +137,7 @@ class Planner(eqx.Module):
 
     def _judged(self, observations: Array, state: Array | None) -> Array | None:
         """The present (B, N, D') as the World sees it that guides, where one does."""
-        return None if self.world is None else self.world.map(observations, state)
+        return None if self.guide is None else self.guide.world.map(observations, state)
 
     def _kept(self, carry: PyTree, past: Array, present: Array, plan: Array) -> PyTree:
         if self.history:
@@ -227,11 +218,8 @@ class Planner(eqx.Module):
 
         def steered(z: Array, k: Array) -> Array:
             clean = made.plan(made.predict(z, k))
-            if judged is not None and o.value_guidance:
-                clean = self._climbed(made, context[:, -1], judged, clean)
-            if judged is not None and self.guidance:
-                short = partial(self._short_of_margin, made, context[:, -1], judged)
-                clean = cleared(short, clean, self.guidance, ROUNDS)
+            if judged is not None:
+                clean = self._steered(made, context[:, -1], judged, clean)
             if o.reconcile:
                 clean = self.normaliser.apply(self.agreed(self.normaliser.invert(clean)))
             return made.rest(clean)
@@ -240,31 +228,27 @@ class Planner(eqx.Module):
         z = diffusion.sample(steered, made.inpaint, (b, rows, n, d), bar, key, *how)
         return self.agreed(self.normaliser.invert(made.plan(z)))
 
-    def _short_of_margin(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
-        """(B,) what the World says that the first step of plans (B, rows, N, D) lacks of the margin."""
-        ahead = self.agreed(self.normaliser.invert(made.inpaint(clean)))[:, self.history + 1]
-        return lacking(self, judged, self.towards(present, ahead))
+    def _steered(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
+        """Plans (B, rows, N, D) whose actions are worth more to the World that guides."""
+        guide, first = self.guide, self.history + 1
+        assert guide is not None, "or nothing is judged"
 
-    def _climbed(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
-        """Plans (B, rows, N, D) whose actions are worth more to the World."""
-        world, rows = self.world, min(self.rows_planned, AHEAD_ROWS)
-        assert world is not None, "a World guides what values guide"
+        def rows_of(x: Array) -> Array:
+            return self.agreed(self.normaliser.invert(made.inpaint(x)))[:, first : first + ROWS]
 
-        def actions_of(x: Array) -> Array:
-            plan = self.agreed(self.normaliser.invert(made.inpaint(x)))[:, self.history + 1 :]
-            return self.tracked(present, plan[:, :rows], world)
-
-        how = (self.options.value_guidance, CLIMBS)
-        return climbed(actions_of, lambda actions: worth(self, judged, actions), clean, *how)
+        foreseen = guide.world.map.names == self.feature_map.names
+        return guide.moved(judged, Way(rows_of, self.towards, present, foreseen), clean, ROUNDS)
 
     def tracked(self, present: Array, rows: Array, world: World) -> Array:
         """Actions (B, K, N, A) in [−1, 1] by which inverse dynamics tracks `rows` (B, K, N, D) of plans from the
         present (B, N, D): along what the World foresees, if it reads the same view, else along the plans."""
-        same, x, actions = world.map.names == self.feature_map.names, present, []
-        for row in jnp.moveaxis(rows, 1, 0):
-            actions.append(self.towards(x, row))
-            x = world.dynamics.step(x, actions[-1])[0] if same else row
-        return jnp.stack(actions, 1)
+        same = world.map.names == self.feature_map.names
+
+        def step(x: Array, row: Array) -> tuple[Array, Array]:
+            action = self.towards(x, row)
+            return world.dynamics.step(x, action)[0] if same else row, action
+
+        return jnp.moveaxis(jax.lax.scan(step, present, jnp.moveaxis(rows, 1, 0))[1], 0, 1)
 
     def towards(self, x: Array, row: Array) -> Array:
         """Actions (B, N, A) in [−1, 1] that inverse dynamics reads off a step from features (B, N, D) to others."""

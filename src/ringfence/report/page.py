@@ -331,7 +331,7 @@ class Recorded:
     @property
     def size(self) -> tuple[float, float]:
         """What it is chosen by: plans drawn, guidance by value."""
-        return self.plans, (self.row.result.get("options") or {}).get("value_guidance", 0.0)
+        return self.plans, (self.row.result.get("options") or {}).get("value_guidance") or 0.0
 
 
 def of_line(line: Line) -> Recorded | None:

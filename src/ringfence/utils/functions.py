@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -74,17 +74,19 @@ def _takes(signature: inspect.Signature, count: int) -> bool:
 
 ATOMS = {type(None), bool, int, float, complex, str, bytes, type(...)}
 STREAMS = (random.Random, np.random.RandomState, np.random.Generator, np.random.BitGenerator)
+Streams = Literal["by kind", "by state", "as unknown"]
 LOCKS = (type(threading.Lock()), type(threading.RLock()))
 ARRAYS = ("numpy", "jax", "jaxlib", "torch")  # whose arrays are their numbers
 CLOSED = object()  # stands for what nobody can look into
 
 
-def content_of(value: Any) -> str:
+def content_of(value: Any, streams: Streams = "by kind") -> str:
     """The digest (12 letters) of a function's code, of the values that it captures, reads by their names and has bound,
     of an object's class and attributes, and of the modules that it reaches, with all that they hold. Of installed
-    packages the name alone counts, and so does the kind of a random stream, wherever it stands. What changes as it acts
-    may say by an attribute `made_of` what it is. A blank and a kind follow where something of that kind is held that
-    tells nothing of itself, such as a generator or an open file: two of these are never known to be the same."""
+    packages the name alone counts, and so does the kind of a random stream, wherever it stands, unless `streams` say
+    otherwise. What changes as it acts may say by an attribute `made_of` what it is. A blank and a kind follow where
+    something of that kind is held that tells nothing of itself, such as a generator or an open file: two of these are
+    never known to be the same."""
     digest = hashlib.blake2b(digest_size=6)
     things, number, closed = [value], {id(value): 0}, ""
 
@@ -106,10 +108,17 @@ def content_of(value: Any) -> str:
         things[:] = [[value]]
     for thing in things:  # which grows
         digest.update(f"{_name(type(thing))} of".encode())
-        for part in _parts(thing):
+        for part in _drawn(thing, streams) or _parts(thing):
             closed = closed or _name(type(thing)) * (part is CLOSED)
             write(None if part is CLOSED else part)
     return f"{digest.hexdigest()} {closed}".strip()
+
+
+def _drawn(value: Any, streams: Streams) -> Iterable[Any]:
+    """What a random stream tells of itself, where its kind is not enough; else nothing."""
+    if streams == "by kind" or not isinstance(value, STREAMS) or not _is_installed(type(value).__module__):
+        return ()
+    return [CLOSED] if streams == "as unknown" else [pickle.dumps(value, 4)]
 
 
 def _parts(value: Any) -> Iterable[Any]:

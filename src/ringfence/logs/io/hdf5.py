@@ -52,6 +52,7 @@ DEEP, MANY = 8, 4096  # levels of groups within observations or actions, and arr
 APART = 1e-3  # of an entry's deviation: two records of one state differ by rounding alone
 STRAYS = 0.05  # of the steps: more of them that do not lead to the next row are no episodes
 CHUNK = 50_000  # rows at a time
+FLOAT = 4  # bytes of a number in a store
 
 
 def read_hdf5(path: Path, asked: common.Asked) -> tuple[dict[str, Any], str]:
@@ -245,14 +246,15 @@ class Shapes:
     observations: dict[str, tuple[int, ...]]  # arrays and the shapes of their rows
     actions: dict[str, tuple[int, ...]]
     cost: bool
-    size: int  # bytes
+    size: int  # bytes, as they are read
 
 
 def _of_episodes(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> common.Logs:
     """The steps of those episodes, in that order."""
     metadata = _metadata(path, f)
     notes: list[str] = []
-    if isinstance(count := metadata.get("total_episodes"), int | np.integer) and count != len(episodes):
+    count = metadata.get("total_episodes", len(episodes))
+    if isinstance(count, bool) or str(count) not in (str(len(episodes)), f"{len(episodes)}.0"):
         raise StoreError(f"'{path}' holds {len(episodes)} episodes, its metadata tells of {count}; copy it again.")
     found = {name: _shapes(path, f, name) for name in episodes}
     first = found[episodes[0]]
@@ -371,7 +373,7 @@ def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
             if kind == "actions":
                 common.continuous(path, f"{name}/{key}", array)
             parts[kind][key] = array.shape[1:]
-            size += array.nbytes
+            size += max(array.nbytes, FLOAT * math.prod(array.shape))
     infos = arrays.member(path, group, "infos", f"{name}/infos") if "infos" in group else None
     cost = False
     if isinstance(infos, h5py.Group) and "cost" in infos:
@@ -455,6 +457,8 @@ def _action_space(path: Path, metadata: dict, asked: common.Asked, entries: int)
     try:
         boxes = list(_boxes(path, json.loads(metadata["action_space"])))
         low, high = (np.concatenate([_of_entries(box, name, entries) for box in boxes]) for name in ("low", "high"))
+        if len(low) != entries:
+            raise ValueError(f"it has {len(low):,} entries, the file's actions have {entries}")
     except StoreError:
         raise
     except Exception as error:  # JSON of any kind: KeyError, TypeError, OverflowError, RecursionError, ...
