@@ -226,7 +226,7 @@ def test_poses_without_velocities(tmp_path, kind, form):
         [[k, 3, -4, 2.5] for k in range(3)],
         rtol=1e-12,
     )
-    with pytest.raises(UserError, match="odom, cmd, joints and cost of 'a' name one topic twice"):
+    with pytest.raises(UserError, match=" of 'a' are one topic"):
         read_bag(write(tmp_path, messages, "mcap"), ["/a"], odom="pose", cmd="pose")
 
 
@@ -636,5 +636,5 @@ def test_a_stamp_that_is_late_is_refused(tmp_path):
 @pytest.mark.parametrize("roles", [{"odom": "cmd_vel"}, {"cmd": "odom"}, {"cost": "odom"}, {"joints": "odom"}])
 def test_one_topic_is_of_one_role(tmp_path, roles):
     path = write(tmp_path, pair())
-    with pytest.raises(UserError, match="of 'r0' name one topic twice"):
+    with pytest.raises(UserError, match="of 'r0' are one topic"):
         read_bag(path, "/r{i}", **roles)

@@ -161,8 +161,10 @@ def _asked_of(
             topics["joints"] = joined(prefix, joints)
         if cost is not None:
             topics["cost"] = costs[k]
-        if len(set(topics.values())) < len(topics):
-            raise UserError(f"odom, cmd, joints and cost of '{name}' name one topic twice; each needs one of its own.")
+        roles = {topic: [role for role in topics if topics[role] == topic] for topic in topics.values()}
+        for topic, shared in roles.items():
+            if len(shared) > 1:
+                raise UserError(f"{' and '.join(shared)} of '{name}' are one topic, '{topic}'; give each its own.")
         found.append((name, topics))
     return found
 
