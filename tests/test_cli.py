@@ -180,7 +180,7 @@ def test_the_whole_job(tmp_path, monkeypatch, capsys):
     starts = {tuple(r["per_episode"]["unsafe_start"]) for found in results for r in found.values()}
     assert len(results) == 2 and len(starts) == 1
     told = capsys.readouterr().out
-    assert "BC, full guard, learned" in told and "ICBF, values guide, too" in told
+    assert "BC, full guard, learned" in told and "MADIFF" in told
     assert "of 1000 held-out steps" in told
 
 
