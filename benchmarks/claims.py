@@ -776,6 +776,28 @@ def values_guide() -> tuple[bool, str]:
 
 
 @on("results/planner")
+def guided_under_shield() -> tuple[bool, str]:
+    """Guided plans under a shield beside plans of the same runs that nothing guides under it, on Spread's tiers: what
+    they earn more, beside what the shield takes of guided plans, and what they cost."""
+    words, holds = [], True
+    for task in planner_tables.SPREAD:
+        task = f"simple_spread-{task}"
+        rows = planner_tables.rows_of("rows", task)
+        guided, plain, free = (
+            planner_tables.played(rows, "icbf", way) for way in ("under shield, guided", "under shield", "as it is")
+        )
+        more, taken = (
+            TASKS[task].normalised_return(x) - TASKS[task].normalised_return(y)
+            for x, y in (planner_tables.paired(guided, plain), planner_tables.paired(free, guided))
+        )
+        low, _ = mean_of_runs(more)
+        cost = max(r["cost_safe_start"] for r in guided)
+        holds = holds and low > 0 and taken.mean() < 0.02 and cost == 0 and len(more) >= 3
+        words.append(f"{task} {more.mean():+.2f}, of free plans {-taken.mean():+.3f}, cost {cost}, {len(more)} seeds")
+    return bool(holds), "; ".join(words)
+
+
+@on("results/planner")
 def guided_elsewhere() -> tuple[bool, str]:
     """Steps in contact on systems beside the paper's."""
     words, holds = [], True
@@ -957,6 +979,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "plans earn** 1.24 of the scale at no cost": planner_reaches(FIVE, 1.235, 0.005, seeds=3),
         "Danger that guides takes the cost, and no return": guidance_takes_cost,
         "Values that guide plans earn more on every tier": values_guide,
+        "Under a `shield` guided plans keep their return, and touch nobody": guided_under_shield,
         "On two systems of the proving ground": guided_elsewhere,
         "Where values are climbed no difference was shown": same_from_plans,
         "plans earn more than clones in the mean of eight of nine robot data sets": plans_run,

@@ -48,6 +48,7 @@ PLAYS: dict[str, dict[str, Any]] = {
     "alone": ALONE,
     "danger alone": {"value_guidance": 0.0},
     **{f"under {guard}": how for guard, how in GUARDED.items()},
+    "under shield, guided": GUARDED["shield"] | {"value_guidance": 1.0},
     "cool": COOL,
     "cool, alone": COOL | ALONE,
     "cool, under adapt": COOL | GUARDED["adapt"],

@@ -67,6 +67,7 @@ WAYS = {
     "alone": "nothing guides (`madiff`)",
     "danger alone": "danger alone guides",
     "as it is": "`icbf`: values guide, too",
+    "under shield, guided": "the same under `shield`",
 }
 
 
