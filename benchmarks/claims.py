@@ -748,79 +748,88 @@ def planner_reaches(task: str, least: float, most: float, seeds: int = 5) -> Che
     return check
 
 
+TIERS = tuple(f"simple_spread-{tier}" for tier in planner_tables.SPREAD)
+
+
+def on_each(tasks: Iterable[str], judge: Callable[[str], tuple[bool, str]]) -> tuple[bool, str]:
+    """Whether it holds on all tasks, and what was found on each."""
+    found = {task: judge(task) for task in tasks}
+    return all(bool(holds) for holds, _ in found.values()), "; ".join(f"{k} {words}" for k, (_, words) in found.items())
+
+
 @on("results/planner")
 def guidance_takes_cost() -> tuple[bool, str]:
     """On both logs, return gained and cost left where danger alone guides, on the same runs and resets."""
-    words, holds = [], True
-    for task in (LEARNER, FIVE):
+
+    def judge(task: str) -> tuple[bool, str]:
         (guided, left), (alone, cost) = (planned("rows", task, "icbf", way) for way in ("danger alone", "alone"))
         low, high = mean_of_runs(guided - alone)
-        holds = holds and low > -0.01 and left.mean() < 0.03 * cost.mean()
-        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {cost.mean():.2f} to {left.mean():.2f}")
-    return bool(holds), "; ".join(words)
+        holds = low > -0.01 and left.mean() < 0.03 * cost.mean()
+        return holds, f"[{low:+.3f}, {high:+.3f}], {cost.mean():.2f} to {left.mean():.2f}"
+
+    return on_each((LEARNER, FIVE), judge)
 
 
 @on("results/planner")
 def values_guide() -> tuple[bool, str]:
     """Plans that values guide, too, beside those that danger alone guides, of the same runs on the same resets."""
-    words, holds = [], True
-    for task in planner_tables.SPREAD:
-        task = f"simple_spread-{task}"
+
+    def judge(task: str) -> tuple[bool, str]:
         (steered, cost), (plain, _) = (planned("rows", task, "icbf", way) for way in ("as it is", "danger alone"))
         low, high = mean_of_runs(steered - plain)
         printed = planner_tables.paper.PRINTED[task][1][2][0]
-        holds = holds and low > 0 and cost.mean() <= 0.05 and steered.mean() > printed and len(steered) >= 3
+        holds = low > 0 and cost.mean() <= 0.05 and steered.mean() > printed and len(steered) >= 3
         apart = f"{steered.mean():.2f} [{low:+.3f}, {high:+.3f}]"
-        words.append(f"{task} {apart} at {cost.mean():.3f}, {len(steered)} seeds")
-    return bool(holds), "; ".join(words)
+        return holds, f"{apart} at {cost.mean():.3f}, {len(steered)} seeds"
+
+    return on_each(TIERS, judge)
 
 
 @on("results/planner")
 def guided_under_shield() -> tuple[bool, str]:
     """Guided plans under a shield beside plans of the same runs that nothing guides under it, on Spread's tiers: what
     they earn more, beside what the shield takes of guided plans, and what they cost."""
-    words, holds = [], True
-    for task in planner_tables.SPREAD:
-        task = f"simple_spread-{task}"
+
+    def judge(task: str) -> tuple[bool, str]:
         rows = planner_tables.rows_of("rows", task)
         guided, plain, free = (
             planner_tables.played(rows, "icbf", way) for way in ("under shield, guided", "under shield", "as it is")
         )
         more, taken = (
-            TASKS[task].normalised_return(x) - TASKS[task].normalised_return(y)
-            for x, y in (planner_tables.paired(guided, plain), planner_tables.paired(free, guided))
+            np.subtract(*(TASKS[task].normalised_return(x) for x in planner_tables.paired(*both)))
+            for both in ((guided, plain), (free, guided))
         )
         low, _ = mean_of_runs(more)
         cost = max(r["cost_safe_start"] for r in guided)
-        holds = holds and low > 0 and taken.mean() < 0.02 and cost == 0 and len(more) >= 3
-        words.append(f"{task} {more.mean():+.2f}, of free plans {-taken.mean():+.3f}, cost {cost}, {len(more)} seeds")
-    return bool(holds), "; ".join(words)
+        holds = low > 0 and taken.mean() < 0.02 and cost == 0 and len(more) >= 3
+        return holds, f"{more.mean():+.2f}, of free plans {-taken.mean():+.3f}, cost {cost}, {len(more)} seeds"
+
+    return on_each(TIERS, judge)
 
 
 @on("results/planner")
 def guided_elsewhere() -> tuple[bool, str]:
     """Steps in contact on systems beside the paper's."""
-    words, holds = [], True
-    for task in planner_tables.PROVING:
+
+    def judge(task: str) -> tuple[bool, str]:
         (_, left), (_, cost) = (planned("rows", task, "icbf", way) for way in ("as it is", "alone"))
-        holds = holds and left.max() <= 0.03 and cost.min() >= 26
-        words.append(f"{task} {cost.mean():.1f} to {left.mean():.3f}, {len(left)} seeds")
-    return bool(holds), "; ".join(words)
+        return left.max() <= 0.03 and cost.min() >= 26, f"{cost.mean():.1f} to {left.mean():.3f}, {len(left)} seeds"
+
+    return on_each(planner_tables.PROVING, judge)
 
 
 @on("results/planner")
 def same_from_plans() -> tuple[bool, str]:
     """What `full` earns from plans less what it earns from clones, by the same seeds on the same resets."""
-    words, holds = [], True
-    for task in planner_tables.SPREAD:
-        task = f"simple_spread-{task}"
+
+    def judge(task: str) -> tuple[bool, str]:
         rows = planner_tables.rows_of("guards", task)
         both = [planner_tables.played(rows, name, "under full") for name in ("icbf", "bc")]
-        plans, clones = (TASKS[task].normalised_return(x) for x in planner_tables.paired(*both))
-        low, high = mean_of_runs(plans - clones)
-        holds = holds and low < 0 < high and len(plans) >= 3
-        words.append(f"{task} [{low:+.3f}, {high:+.3f}], {len(plans)} seeds")
-    return bool(holds), "; ".join(words)
+        apart = np.subtract(*(TASKS[task].normalised_return(x) for x in planner_tables.paired(*both)))
+        low, high = mean_of_runs(apart)
+        return low < 0 < high and len(apart) >= 3, f"[{low:+.3f}, {high:+.3f}], {len(apart)} seeds"
+
+    return on_each(TIERS, judge)
 
 
 @on("results/planner")
