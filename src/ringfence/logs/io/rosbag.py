@@ -17,6 +17,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.bagfile import ROLES, SHOWN, BagFile, Topic, joined, opened, topic_name
+from ringfence.logs.io.tracks import PASSED_OVER
 from ringfence.utils.files import place
 from ringfence.utils.text import natural
 
@@ -28,7 +29,6 @@ CLOCK = 1.0  # s; stamps further from the times of recording come from another c
 LATE = 5.0  # s; a stamp so much further from its time of recording than the topic's others is of another time
 JOINTS = 1000  # names of joints that a topic may hold
 LARGEST = 1e30  # of any number; a store holds float32
-PASSED_OVER = 0.05  # share of the commands that come between rows, above which it is said
 LEVEL = 0.5  # m; what changes its height by more does not move in a plane
 MOVING = 0.05  # m/s; slower rows do not tell in which frame a twist is
 

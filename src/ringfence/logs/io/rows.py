@@ -442,7 +442,9 @@ def _middle(zone: int) -> float:
 def refuse_turns(rows: Rows, values: Values, schema: TableSchema) -> None:
     """Refuse entries that jump by whole turns, as angles do that no name tells: halfway between two rows there would
     be half a turn."""
-    for name in set(schema.state) - {*schema.position, *schema.velocity}:
+    for name in schema.state:
+        if name in (*schema.position, *schema.velocity):
+            continue
         value = values.columns[name]
         change = np.abs(np.diff(value))[rows.follows]
         for turn, unit in TURNS.items():

@@ -48,11 +48,19 @@ from ringfence.logs.io.rows import (
     without_jumps,
 )
 from ringfence.logs.io.table_schema import TableSchema
-from ringfence.logs.io.tracks import Clock, Tracks, clock_of, off_the_clock, on_whole_steps, resample, unrounded
+from ringfence.logs.io.tracks import (
+    PASSED_OVER,
+    Clock,
+    Tracks,
+    clock_of,
+    off_the_clock,
+    on_whole_steps,
+    resample,
+    unrounded,
+)
 from ringfence.logs.moving import looked_at, origins_of
 from ringfence.problem.constraints import CostColumn
 
-PASSED_OVER = 0.05  # share of the rows at which commands change, above which longer steps are said to pass some over
 USUAL = 0.999  # of accelerations, that are no outliers
 RECORDING = "ringfence.recording"  # column that tells apart what is of several tables
 AGENT, COLUMN = "{agent}", "{column}"  # in how wide tables call columns

@@ -16,6 +16,7 @@ from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.rows import Rows
 from ringfence.logs.io.table_schema import TableSchema
 
+PASSED_OVER = 0.05  # share of commands that come between steps, or between a bag's rows, above which it is said
 GAP = 5.0  # steps without a row that end an episode
 EXACT = 0.05  # of a step, by which a round number of seconds or hertz may be off at a recording's end
 DIGITS = 1e-5  # of a step, which six digits leave open
