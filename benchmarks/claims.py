@@ -793,7 +793,7 @@ def guided_under_shield() -> tuple[bool, str]:
     def judge(task: str) -> tuple[bool, str]:
         rows = planner_tables.rows_of("rows", task)
         guided, plain, free = (
-            planner_tables.played(rows, "icbf", way) for way in ("under shield, guided", "under shield", "as it is")
+            planner_tables.played(rows, "icbf", way) for way in ("under shield", "under shield, alone", "as it is")
         )
         more, taken = (
             np.subtract(*(TASKS[task].normalised_return(x) for x in planner_tables.paired(*both)))

@@ -48,10 +48,11 @@ PLAYS: dict[str, dict[str, Any]] = {
     "alone": ALONE,
     "danger alone": {"value_guidance": 0.0},
     **{f"under {guard}": how for guard, how in GUARDED.items()},
-    "under shield, guided": GUARDED["shield"] | {"value_guidance": 1.0},
+    "under shield, alone": GUARDED["shield"] | ALONE,
     "cool": COOL,
     "cool, alone": COOL | ALONE,
     "cool, under adapt": COOL | GUARDED["adapt"],
+    "cool, under adapt, alone": COOL | GUARDED["adapt"] | ALONE,
     "cool, values guide": COOL | {"value_guidance": 1.0},  # as it is where V knows how to stay safe
     **{f"{n} steps": {"sampling_steps": n} for n in (1, 2, 3, 10, 20)},
     **{f"temperature {t:g}": {"temperature": t} for t in (0.0, 0.3)},
@@ -98,7 +99,7 @@ GROUPS: dict[str, dict[str, Any]] = {
     "rows": {
         "tasks": SPREAD + POOLED + ("proving-hall", "proving-discs"),
         "rows": {"icbf": ("icbf", "", {})},
-        "plays": ("as it is", "danger alone", "alone"),
+        "plays": ("as it is", "danger alone", "alone", "under shield", "under shield, alone"),
     },
     "ablations": {"tasks": LEARNED, "rows": ABLATIONS, "plays": ("alone",)},
     "frontier": {"tasks": LEARNED, "rows": SHAPED, "plays": ("as it is", "alone")},
@@ -115,17 +116,17 @@ GROUPS: dict[str, dict[str, Any]] = {
     "guards": {
         "tasks": SPREAD,
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("under shield", "under full"),
+        "plays": ("under full",),
     },
     "robots": {
         "tasks": ROBOTS,
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("cool", "cool, values guide", "cool, alone", "cool, under adapt"),
+        "plays": ("cool", "cool, values guide", "cool, alone", "cool, under adapt", "cool, under adapt, alone"),
     },
     "crossing": {
         "tasks": ("crossing-hasty",),
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("as it is", "danger alone", "alone", "under shield"),
+        "plays": ("as it is", "danger alone", "alone", "under shield", "under shield, alone"),
     },
 }
 

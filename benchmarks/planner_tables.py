@@ -67,7 +67,7 @@ WAYS = {
     "alone": "nothing guides (`madiff`)",
     "danger alone": "danger alone guides",
     "as it is": "`icbf`: values guide, too",
-    "under shield, guided": "the same under `shield`",
+    "under shield": "the same under `shield`",
 }
 
 
@@ -152,10 +152,10 @@ def glance() -> str:
                 r for w in ("1", "0.1", "10") for r in played(rows_of("algorithm1", task), f"λ = {w}", "as it is")
             ]
             best = max({r["name"] for r in algorithm1}, key=lambda n: _mean(algorithm1, n), default=None)
-            guarded = rows_of("guards", task)
+            rows = rows_of("rows", task)
             cells.append(brief([r for r in algorithm1 if r["name"] == best]))
-            cells.append(brief(played(rows_of("rows", task), "icbf", "as it is")))
-            cells += [brief(played(guarded, "icbf", f"under {guard}")) for guard in ("shield", "full")]
+            cells += [brief(played(rows, "icbf", way)) for way in ("as it is", "under shield")]
+            cells.append(brief(played(rows_of("guards", task), "icbf", "under full")))
             clones = sums_of("guards", task, ("bc", "default+shield-learned"))
             cells.append(clones if clones != "–" else pooled_row(task, "bc, 20,000 updates, under shield"))
             logs = sums_of("simple_spread", task, ("behaviour data", "reference"))

@@ -1,13 +1,15 @@
 """What long work says of itself: one bar, what is left, and no long silence."""
 
+import threading
 import time
 import types
 
 import pytest
 
+from ringfence.errors import UserError
 from ringfence.training import worlds
 from ringfence.utils import progress
-from ringfence.utils.progress import Parts, Progress
+from ringfence.utils.progress import Parts, Progress, beside
 from tests.quick import QUICK_WORLD
 
 
@@ -36,6 +38,54 @@ def test_what_is_left_follows_from_what_it_took(clock, capsys):
             clock.now = 60.0
     assert capsys.readouterr().err == "World: 100/100, 60 s  \n" * 2
     assert bar.seconds == {"a": 20.0, "b": 30.0, "c": 10.0, "unexpected": 10.0}
+
+
+def test_work_beside_other_work_is_shown_by_the_same_bar(clock, capsys):
+    """Both parts count, by what each has done, and what is made comes back; what failed fails where it is asked for."""
+    at_half, seen = threading.Event(), threading.Event()
+
+    def make() -> str:
+        with bar.part("beside"), Progress("values", 4) as inner:
+            inner.advance(2)
+            at_half.set()
+            assert seen.wait(10)
+            inner.advance(2)
+        return "made"
+
+    with Parts("World", [("a", 10.0), ("beside", 30.0)]) as bar:
+        with beside(make) as made, bar.part("a"):
+            assert at_half.wait(10)
+            clock.now = 5.0
+            bar._show(at_once=True)
+            seen.set()
+        assert made() == "made"
+    assert "World: 38/100, 5 s  " in capsys.readouterr().err
+    assert set(bar.seconds) == {"a", "beside"}
+
+    def fails() -> None:
+        raise UserError("no")
+
+    with pytest.raises(UserError, match="no"), beside(fails) as failed:
+        failed()
+
+
+def test_what_nobody_waits_for_is_given_up():
+    begun, told = threading.Event(), []
+
+    def for_ever() -> None:
+        with Progress("values", 10**9, quiet=True) as bar:
+            try:
+                while True:
+                    bar.advance(1)
+                    begun.set()
+            except KeyboardInterrupt:
+                told.append("given up")
+                raise
+
+    with pytest.raises(UserError, match="bad"), beside(for_ever):
+        assert begun.wait(10)
+        raise UserError("bad")
+    assert told == ["given up"]
 
 
 def test_nobody_is_silent_for_long(monkeypatch, capsys):

@@ -79,6 +79,7 @@ def demonstrate(folder: Path, tier: str = "expert", quick: bool = False) -> Path
     from ringfence.evaluation.evaluate import evaluate
     from ringfence.report import build_report
     from ringfence.training import loop, worlds
+    from ringfence.utils.progress import beside
 
     said = Console(highlight=False)
     begun = time.monotonic()
@@ -89,21 +90,29 @@ def demonstrate(folder: Path, tier: str = "expert", quick: bool = False) -> Path
     small = {"num_updates": 60, "batch": 32, "barrier_batch": 16, "width": 64}
     known = {f"{part}_updates": 100 for part in ("dynamics", "value", "barrier", "future")}
     shared = {"out": folder / "runs", "changes": small if quick else {}, "world": known if quick else {}}
-    cloned = loop.train("bc", store, out=folder / "runs", changes={"num_updates": 60} if quick else {})[0]
-    planner = loop.train("icbf", store, **shared)[0]
+    of_clone: dict[str, Any] = {"changes": {"num_updates": 60} if quick else {}, "quiet": True}
+    with beside(lambda: loop.train("bc", store, out=folder / "runs", **of_clone)) as clones:
+        planner = loop.train("icbf", store, **shared)[0]
+    cloned = clones()[0]
     rows = dict(reference.make(task, store, folder / "runs", episodes))
     protocol: dict[str, Any] = {"episodes": episodes, "num_recorded": 4, "quiet": False}
     fewer: dict[str, Any] = {"sampling_steps": 2} if quick else {}
     learned: dict[str, Any] = {"barrier": "learned", "anyway": quick}  # so little training is unfit to guard by
     world = worlds.of_run(planner)
     said.print(str(world.card), soft_wrap=True, markup=False)
-    rows["BC"] = evaluate(cloned, **protocol)
-    rows["BC, shielded, formula"] = evaluate(cloned, guard="shield", barrier="analytic", world=world, **protocol)
-    rows["BC, shielded, learned"] = evaluate(cloned, guard="shield", world=world, **learned, **protocol)
-    rows["MADIFF"] = evaluate(planner, barrier_guidance=0.0, **protocol, **fewer)
-    rows["ICBF"] = evaluate(planner, anyway=quick, **protocol, **fewer)
     rounds: dict[str, Any] = {"optimizer_steps": 2} if quick else {}
-    rows["BC, full guard, learned"] = evaluate(cloned, guard="full", world=world, **learned, **protocol, **rounds)
+
+    def planned() -> dict[str, dict]:
+        of_plans = protocol | fewer | {"quiet": True}
+        alone = evaluate(planner, barrier_guidance=0.0, **of_plans)
+        return {"MADIFF": alone, "ICBF": evaluate(planner, anyway=quick, **of_plans)}
+
+    with beside(planned) as plans:
+        rows["BC"] = evaluate(cloned, **protocol)
+        rows["BC, shielded, formula"] = evaluate(cloned, guard="shield", barrier="analytic", world=world, **protocol)
+        rows["BC, shielded, learned"] = evaluate(cloned, guard="shield", world=world, **learned, **protocol)
+        full = evaluate(cloned, guard="full", world=world, **learned, **protocol, **rounds)
+    rows |= plans() | {"BC, full guard, learned": full}
     table = Table(
         Column("", no_wrap=True), "return", "norm.", "cost", "safe starts", "unsafe episodes", title=task.name
     )

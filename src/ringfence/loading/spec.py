@@ -113,6 +113,12 @@ class PolicySpec:
         return self.guard != "none" or bool(self.guard_options)
 
     @property
+    def guard_climbs(self) -> bool:
+        """Whether its guard climbs values itself."""
+        options = {**GUARDS[self.guard], **dict(self.guard_options)}
+        return options.get("optimizer_steps", 0) > 0
+
+    @property
     def name(self) -> str:
         """Planner, guard with its barrier and execution, and the options given beside them; `default` without any."""
         parts = [] if self.planner == DEFAULT else [self.planner]

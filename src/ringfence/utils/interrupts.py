@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from socket import socket, socketpair
 
@@ -24,9 +25,10 @@ STATUS = 130  # of a process that Ctrl-C ended
 MOMENT = 2.0  # s within which it is to be honoured
 BOUNCE = 0.3  # s within which it is one press that several processes tell of
 unfinished: set[Path] = set()  # files and folders that are being written
+given_up_by: ContextVar[threading.Event | None] = ContextVar("given_up_by", default=None)  # of work beside other work
 _asked = False
 _honoured = False
-_held: list[object] = []
+_held: dict[object, object] = {}  # what is kept, by who finishes something first
 _told: tuple[socket, socket] | None = None  # into one of which the system writes at once, whatever Python does
 
 
@@ -75,7 +77,7 @@ def _insist(told: socket) -> None:
     while told.recv(1)[0] != signal.SIGINT:
         pass
     _asked, begun = True, time.monotonic()
-    while any(_held) or _honoured or time.monotonic() - begun < MOMENT:
+    while any(list(_held.values())) or _honoured or time.monotonic() - begun < MOMENT:
         if select.select([told], [], [], 0.05)[0]:
             again = told.recv(1)[0] == signal.SIGINT
             if again and time.monotonic() - begun > BOUNCE:
@@ -95,8 +97,10 @@ def asked() -> bool:
 
 
 def check() -> None:
-    """Raise what was asked for, if it has not ended this process yet."""
+    """Raise what was asked for, if it has not ended this process yet; also in work that nobody waits for any more."""
     global _honoured
+    if (given_up := given_up_by.get()) is not None and given_up.is_set():
+        raise KeyboardInterrupt
     if _asked and threading.current_thread() is threading.main_thread():
         _honoured = True
         raise KeyboardInterrupt
@@ -105,9 +109,10 @@ def check() -> None:
 @contextmanager
 def held(kept: object = True) -> Iterator[None]:
     """Finish this first, or get to a check, as long as there is something to be `kept`."""
-    _held.append(kept)
+    mine = object()
+    _held[mine] = kept
     try:
         yield
     finally:
-        _held.pop()
+        del _held[mine]
     check()

@@ -1,15 +1,17 @@
-"""Progress of long work: a bar on a terminal, plain lines elsewhere. What is done within other work is shown by its
-bar."""
+"""Progress of long work: a bar on a terminal, plain lines elsewhere. What is done within other work, or beside it, is
+shown by its bar."""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar, Token
-from typing import Self
+from contextvars import ContextVar, Token, copy_context
+from dataclasses import dataclass, field
+from typing import Self, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -32,7 +34,29 @@ SHOWN = (
 TRUST = 20.0  # s for which what was expected is believed: a part begins by compiling
 SILENT = 4.0  # s after which something is said, however long a step takes
 
+T = TypeVar("T")
+
 _outer: ContextVar[Progress | None] = ContextVar("outer", default=None)
+_part: ContextVar[_Part] = ContextVar("part")
+
+
+@contextmanager
+def beside(make: Callable[[], T]) -> Iterator[Callable[[], T]]:
+    """While it is open `make` works in a thread of its own. What is given waits for it, and returns what it made; where
+    the block fails, it is given up."""
+    given_up = threading.Event()
+
+    def run() -> T:
+        interrupts.given_up_by.set(given_up)
+        return make()
+
+    with ThreadPoolExecutor(1) as pool:
+        job = pool.submit(copy_context().run, run)
+        try:
+            yield job.result
+        except BaseException:
+            given_up.set()
+            raise
 
 
 class Progress:
@@ -101,6 +125,24 @@ class Progress:
             print(line, end="", file=sys.stderr, flush=True)  # in one piece: two threads speak
 
 
+@dataclass(eq=False)
+class _Part:
+    """One that is worked at."""
+
+    name: str
+    expected: float  # seconds
+    several: int  # stages
+    stages: list[str] = field(default_factory=list)  # by their labels
+    share: float = 0.0  # that is done
+
+    def told(self, label: str, share: float) -> None:
+        """So much of that stage is done."""
+        if label not in self.stages:
+            self.stages.append(label)
+        done = len(self.stages) - 1 + share
+        self.share = max(self.share, done / max(self.several, len(self.stages)))
+
+
 class Parts(Progress):
     """Work in several parts, in per cent, and what is left: by how long each is expected to take, in seconds, and how
     long those took that are done."""
@@ -110,45 +152,47 @@ class Parts(Progress):
         self.expected = list(expected)  # of what is to be done
         self.seconds: dict[str, float] = {}  # that parts took, by name
         self.finished = 0.0  # expected seconds of what is done
-        self.now, self.of_now, self.share = "", 0.0, 0.0
-        self.stages: list[str] = []  # of the part that is worked at, by their labels
-        self.several = 1
+        self.open: list[_Part] = []  # worked at, one beside the other
+        self.lock = threading.Lock()
 
     @contextmanager
     def part(self, name: str, several: int = 1) -> Iterator[None]:
         """While it is open, that part is worked at, which has so many stages."""
-        self.now, self.of_now, self.share = name, self.skip(name), 0.0
-        self.stages, self.several = [], several
-        began = time.monotonic()
+        one = _Part(name, self.skip(name), several)
+        self.open.append(one)
+        token, began = _part.set(one), time.monotonic()
         try:
             yield
         finally:
+            _part.reset(token)
             took = time.monotonic() - began
-            self.seconds[name] = self.seconds.get(name, 0.0) + took
-            self.finished += self.of_now or took
-            self.now, self.of_now = "", 0.0
+            with self.lock:
+                self.seconds[name] = self.seconds.get(name, 0.0) + took
+                self.finished += one.expected or took
+                self.open.remove(one)
         interrupts.check()
-        self._show(at_once=not self.expected)
+        self._show(at_once=not (self.expected or self.open))
 
     def skip(self, name: str) -> float:
         """That part need not be done any more; the seconds that it was expected to take, 0 where it was not."""
-        found = next((k for k, (other, _) in enumerate(self.expected) if other == name), None)
-        return 0.0 if found is None else self.expected.pop(found)[1]
+        with self.lock:
+            found = next((k for k, (other, _) in enumerate(self.expected) if other == name), None)
+            return 0.0 if found is None else self.expected.pop(found)[1]
 
     def within(self, label: str, share: float) -> None:
-        if label not in self.stages:
-            self.stages.append(label)
-        done = len(self.stages) - 1 + share
-        self.share = max(self.share, done / max(self.several, len(self.stages)))
+        _part.get().told(label, share)
         self._show()
 
     def _show(self, at_once: bool = False) -> None:
-        done = self.finished + self.share * self.of_now
-        rest = sum(seconds for _, seconds in self.expected) + (1.0 - self.share) * self.of_now
+        with self.lock:
+            done = self.finished + sum(one.share * one.expected for one in self.open)
+            rest = sum(seconds for _, seconds in self.expected)
+            rest += sum((1.0 - one.share) * one.expected for one in self.open)
+            names = " and ".join(one.name for one in self.open)
         spent = time.monotonic() - self.started
         pace = (spent + TRUST) / (done + TRUST)  # seconds of these for one that was expected
         self.done = round(100 * done / max(done + rest, 1e-9))
         left = pace * rest
         words = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
-        self.note = f"{self.now}, about {words} left" if rest else ""
+        self.note = f"{names}, about {words} left" if rest else ""
         super()._show(at_once)

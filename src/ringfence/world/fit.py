@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,8 +26,8 @@ from ringfence.problem import constraints, features
 from ringfence.problem.normalise import varying
 from ringfence.types import Key, Spec
 from ringfence.utils.files import cache_dir, whole
-from ringfence.utils.precision import on_device
-from ringfence.utils.progress import Parts
+from ringfence.utils.precision import in_float32, on_device
+from ringfence.utils.progress import Parts, beside
 from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
 from ringfence.world import cause_search, dynamics, impacts, judging, margins, stops, values
@@ -143,36 +143,33 @@ def fitted(of: Fit) -> tuple[World, Logged, Logged]:
         map = features.alone(map)
     labels = labels_of(store, map, settings, of.hazard) if settings.barrier else {}
     out = held_out(store, of.seed, unsafe_of(labels) if labels else None)
-    as_they_are = logged = Logged.of(store, map, out, labels)
+    logged = Logged.of(store, map, out, labels)
     arrays = store.digest("observations", "state", "actions", "episode_ends", "terminated")
-    moved = [arrays, _digest(out), store.card.bounds, map.turns, _digest(map.plus), _digest(map.minus)]
+    logs = [arrays, _digest(out), store.card.bounds, map.turns, _digest(map.plus), _digest(map.minus)]
 
     blank = blank_world(map, of.spec, settings)
-    value = _values(logged, moved, blank.values, of)
     thrown = impacts.count(logged, of.seed) if labels and settings.labels == "costs" else 0
-    steps = logged.fitted_steps
-    if thrown:
-        steps = steps[~logged.unsafe[steps]]
-        moved.append(_digest(logged.unsafe))
-    known = _stops(logged, steps, blank.dynamics.predicted)
-    moved.append(known)
-    acts = _dynamics(logged, steps, moved, dataclasses.replace(blank.dynamics, stops=known), of)
-    if map.mirrored:
-        acts = _with_partners(acts, logged, steps, moved, of)
-        moved.append(acts.map.mirrored)
-    if thrown:
-        logged = impacts.landed(logged, acts)
-    barrier, causes = _barrier(logged, tuple(labels), moved, acts, of)
+    searched = {} if thrown else _causes(logged, labels, logs, of)
+
+    def apart() -> tuple[values.Values, list[Found]]:
+        """What is read off the logs alone."""
+        return _values(logged, logs, blank.values, of), [each.found for each in searched.values()]
+
+    with beside(in_float32(apart)) as ahead:
+        acts, moved = _moves(logged, thrown, logs, blank.dynamics, of)
+    value, _ = ahead()
+    landed = impacts.landed(logged, acts) if thrown else logged
+    barrier, causes = _barrier(searched or _causes(landed, labels, moved, of), moved, acts, landed.several)
     card = Card(
         format=FORMAT,
-        data=_data(store, logged, thrown, acts),
+        data=_data(store, landed, thrown, acts),
         settings=settings,
         seed=of.seed,
         shape=_shape_in_words(barrier),
         causes=causes,
     )
     world = World(acts, value, barrier, jnp.ones(()), map, of.spec, settings.alone, card)
-    return world, logged, as_they_are
+    return world, landed, logged
 
 
 def _data(store: EpisodeStore, logged: Logged, thrown: int, acts: dynamics.Dynamics) -> Data:
@@ -257,6 +254,23 @@ def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
 # --- parts ---
 
 
+def _moves(
+    logged: Logged, thrown: int, logs: list[Any], blank: dynamics.Dynamics, of: Fit
+) -> tuple[dynamics.Dynamics, list[Any]]:
+    """Stops and dynamics, of safe steps alone where unsafe ones end in an impact, and all that they follow from."""
+    steps = logged.fitted_steps
+    if thrown:
+        steps = steps[~logged.unsafe[steps]]
+        logs = [*logs, _digest(logged.unsafe)]
+    known = _stops(logged, steps, blank.predicted)
+    moved = [*logs, known]
+    acts = _dynamics(logged, steps, moved, dataclasses.replace(blank, stops=known), of)
+    if not logged.map.mirrored:
+        return acts, moved
+    acts = _with_partners(acts, logged, steps, moved, of)
+    return acts, [*moved, acts.map.mirrored]
+
+
 def _dynamics(
     logged: Logged, steps: np.ndarray, moved: list[Any], blank: dynamics.Dynamics, of: Fit
 ) -> dynamics.Dynamics:
@@ -296,18 +310,59 @@ def _values(logged: Logged, moved: list[Any], blank: values.Values, of: Fit) -> 
 
 
 @dataclass(frozen=True, eq=False)
+class _Causes:
+    """Why steps are dangerous by one constraint."""
+
+    logged: Logged
+    moved: list[Any]  # what the logs are
+    of: Fit
+
+    @functools.cached_property
+    def found(self) -> Found:
+        """None where few entries do not explain it, or where it is of a whole body."""
+        settings = self.of.settings
+        plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
+        if not plain or self.logged.map.shared_body or self.logged.map.joint:
+            return Found()
+        content = [*self.moved, _digest(self.logged.label), self.logged.map.names]
+        found = self.of.found("causes", content, Found, lambda: self.search[0])
+        return found if found.explained >= EXPLAINED else Found(searched=True)
+
+    @functools.cached_property
+    def search(self) -> tuple[Found, list[Cells]]:
+        """What a search finds, and the cells of each; made at most once."""
+        logged = self.logged
+        steps = logged.fitted_steps
+        episode = logged.store.episode_of_step[steps]
+        about = logged.after(steps), logged.label[steps], episode, logged.map.names
+        return cause_search.find(*about, self.of.seed, team=not self.of.settings.alone)
+
+
+def _causes(logged: Logged, names: Iterable[str], moved: list[Any], of: Fit) -> dict[str, _Causes]:
+    """Of each constraint."""
+    return {name: _Causes(logged.by(name), moved, of) for name in names}
+
+
+@dataclass(frozen=True, eq=False)
 class _Danger:
     """The danger of one constraint, of which a barrier is made."""
 
-    logged: Logged
+    causes: _Causes
     moved: list[Any]
     acts: dynamics.Dynamics
-    of: Fit
+
+    @property
+    def logged(self) -> Logged:
+        return self.causes.logged
+
+    @property
+    def of(self) -> Fit:
+        return self.causes.of
 
     def barrier(self) -> tuple[Found, cbf.Barrier]:
         """Its causes, and ℓ and V by them; no causes, and networks on all entries, where held-out steps say that
         these tell more."""
-        found = self.causes()
+        found = self.causes.found
         label = self.label(found)
         if found.causes and (recall := self._recall(label)) < ENOUGH:
             none = Found(searched=True)
@@ -319,27 +374,9 @@ class _Danger:
     def _recall(self, label: cbf.Barrier) -> float:
         return judging.recall(label, self.logged, judging.JUDGING)
 
-    def causes(self) -> Found:
-        """None where few entries do not explain it, or where it is of a whole body."""
-        settings = self.of.settings
-        plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
-        if not plain or self.logged.map.shared_body or self.logged.map.joint:
-            return Found()
-        found = self.of.found("causes", self._content(), Found, lambda: self.search[0])
-        return found if found.explained >= EXPLAINED else Found(searched=True)
-
-    @functools.cached_property
-    def search(self) -> tuple[Found, list[Cells]]:
-        """What a search for causes finds, and the cells of each; made at most once."""
-        logged = self.logged
-        steps = logged.fitted_steps
-        episode = logged.store.episode_of_step[steps]
-        about = logged.after(steps), logged.label[steps], episode, logged.map.names
-        return cause_search.find(*about, self.of.seed, team=not self.of.settings.alone)
-
-    def _content(self, *found: Found) -> list[Any]:
+    def _content(self, found: Found) -> list[Any]:
         """What a barrier is made of, beside its settings."""
-        return [*self.moved, _digest(self.logged.label), self.logged.map.names, *found]
+        return [*self.moved, _digest(self.logged.label), self.logged.map.names, found]
 
     def _blank(self, found: Found) -> cbf.Barrier:
         return eqx.filter_eval_shape(cbf.blank_barrier, self.logged.map, self.of.settings, found)
@@ -365,7 +402,7 @@ class _Danger:
         blank = _standardised(cbf.blank_barrier(logged.map, settings, found), logged, key_states)
         if not found.causes:
             return cbf.fit_label(blank, *given)
-        nets = fit_causes(found, self.search[1], *given)
+        nets = fit_causes(found, self.causes.search[1], *given)
         nets = margins.in_own_margins(nets, self.acts, logged, np.random.default_rng(0))
         return dataclasses.replace(blank, causes=nets)
 
@@ -385,15 +422,15 @@ def _digest(array: np.ndarray) -> str:
 
 
 def _barrier(
-    logged: Logged, names: tuple[str, ...], moved: list[Any], acts: dynamics.Dynamics, of: Fit
+    causes: dict[str, _Causes], moved: list[Any], acts: dynamics.Dynamics, several: bool
 ) -> tuple[cbf.Barrier | cbf.MinBarrier | None, dict[str, Found]]:
     """The barrier of all constraints, and the causes of the danger of each; None where there are none."""
-    made = {name: _Danger(logged.by(name), moved, acts, of).barrier() for name in names}
-    causes = {name: found for name, (found, _) in made.items()}
+    made = {name: _Danger(each, moved, acts).barrier() for name, each in causes.items()}
+    found = {name: found for name, (found, _) in made.items()}
     each = tuple(barrier for _, barrier in made.values())
     if not each:
-        return None, causes
-    return cbf.MinBarrier(each, names) if logged.several else each[0], causes
+        return None, found
+    return cbf.MinBarrier(each, tuple(made)) if several else each[0], found
 
 
 def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier:
