@@ -306,14 +306,13 @@ def of_systems() -> tuple[bool, str]:
 
 @on("results/proving/again")
 def of_again() -> tuple[bool, str]:
-    """Systems that were played by Worlds of today, of two seeds: whom they leave in more than one episode of 60."""
+    """Systems that were played by Worlds of today, of three seeds: whom they leave in more than one episode of 60."""
     found = {one["task"].removeprefix("proving-"): one for one in proven("proving/again")}
     rates = {
         who: {name: one["rows"][f"{who} shield learned"]["most"] for name, one in found.items()}
         for who in ("bc", "naive")
     }
-    fit = [name for name, one in found.items() if one["verdicts"] == ["fit", "fit"]]
-    refused = [name for name, one in found.items() if one["verdicts"] == ["unfit", "unfit"]]
+    fit, refused = ([n for n, one in found.items() if one["verdicts"] == [word] * 3] for word in ("fit", "unfit"))
     left = {name: rates["naive"][name] for name in fit if rates["naive"][name] > 1.5 / 60}
     text = f"{len(fit)} of {len(found)} fit; clones {max(rates['bc'][n] for n in fit):.3f} at most; naive {left}"
     holds = (len(found), len(fit), refused) == (16, 14, ["arms", "train"]) and sorted(left) == ["bench", "gears"]

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from ringfence.errors import UserError
+from ringfence.proposals.guidance import DANGER
 from ringfence.utils.config import NonNegative, check_bounds
 from ringfence.world.card import JUDGED
 
@@ -32,7 +33,7 @@ class GuardOptions:
     num_restarts: Samples = 1  # that are refined in all: the proposals, the last plan moved on, and noisy copies
     noise: NonNegative = 0.5  # deviation of noisy copies
     trust_radius: Distance = 2.0  # how far refining may take an action from its proposal; 2: anywhere
-    safety_weight: NonNegative = 10.0  # weight of danger in what is climbed, in deviations of value per margin
+    safety_weight: NonNegative = DANGER  # weight of danger in what is climbed, in deviations of value per margin
     correction_steps: Rounds = 0  # rounds of correction; 0: none
     correction_restarts: Few = 0  # times that one which falls short is begun again from fixed plans
     max_correction: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere

@@ -141,8 +141,8 @@ def resolve(spec: PolicySpec) -> Resolved:
 
 def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:
     """A policy whose sampling is guided by the World that its training read, or else would guard it: by values and
-    danger as asked for, and by both where a method follows a World by itself, its guard climbs no values again, and
-    that World is fit to."""
+    danger as asked for, and by both where a method follows a World by itself and that World is fit to. A guard takes
+    danger itself, and some climb values: what it does anyway, nobody does before it."""
     o = policy.options
     values, danger = o.value_guidance, o.barrier_guidance
     asked = bool(values or danger)
@@ -174,6 +174,8 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
         values = 0.0
     if values:
         require_values(card, spec.anyway)
+    elif spec.guarded and not asked:
+        return policy
     return guided(policy, world, values, danger)
 
 

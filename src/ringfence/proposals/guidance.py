@@ -28,7 +28,7 @@ from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.dynamics import Dynamics
 
 VALUES = 1.0  # v, of a method that follows a World by itself
-DANGER = 10.0  # d, as guards weigh it
+DANGER = 10.0  # d; guards weigh it so, too
 MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
 AHEAD_KEPT = 0.5  # share of safe steps that V has to leave their margin
 ROWS = 5  # K, that are foreseen along a plan
