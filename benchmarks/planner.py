@@ -52,7 +52,6 @@ PLAYS: dict[str, dict[str, Any]] = {
     "cool": COOL,
     "cool, alone": COOL | ALONE,
     "cool, under adapt": COOL | GUARDED["adapt"],
-    "cool, under adapt, alone": COOL | GUARDED["adapt"] | ALONE,
     "cool, values guide": COOL | {"value_guidance": 1.0},  # as it is where V knows how to stay safe
     **{f"{n} steps": {"sampling_steps": n} for n in (1, 2, 3, 10, 20)},
     **{f"temperature {t:g}": {"temperature": t} for t in (0.0, 0.3)},
@@ -121,7 +120,7 @@ GROUPS: dict[str, dict[str, Any]] = {
     "robots": {
         "tasks": ROBOTS,
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("cool", "cool, values guide", "cool, alone", "cool, under adapt", "cool, under adapt, alone"),
+        "plays": ("cool", "cool, values guide", "cool, alone", "cool, under adapt"),
     },
     "crossing": {
         "tasks": ("crossing-hasty",),

@@ -142,12 +142,12 @@ def resolve(spec: PolicySpec) -> Resolved:
 def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:
     """A policy whose sampling is guided by the World that its training read, or else would guard it: by values and
     danger as asked for, and by both where a method follows a World by itself and that World is fit to. A guard takes
-    danger itself, and some climb values: what it does anyway, nobody does before it."""
+    care of danger itself, and some of what is earned: what it does anyway, nobody does before it."""
     o = policy.options
     values, danger = o.value_guidance, o.barrier_guidance
     asked = bool(values or danger)
     alone = o.execution == "decentralized"  # a World sees the whole team
-    by_itself = getattr(job.config, "guides", False) and not (spec.guard_climbs or alone)
+    by_itself = getattr(job.config, "guides", False) and not (spec.guard_decides or alone)
     if danger is None:
         danger = DANGER if by_itself or values else 0.0
     if values is None:

@@ -113,10 +113,11 @@ class PolicySpec:
         return self.guard != "none" or bool(self.guard_options)
 
     @property
-    def guard_climbs(self) -> bool:
-        """Whether its guard climbs values itself."""
+    def guard_decides(self) -> bool:
+        """Whether its guard decides what plans earn: it climbs values itself, or spends what limits allow by a margin
+        that adapts, where guidance keeps it always."""
         options = {**GUARDS[self.guard], **dict(self.guard_options)}
-        return options.get("optimizer_steps", 0) > 0
+        return any(options.get(name, 0) > 0 for name in ("optimizer_steps", "adapt"))
 
     @property
     def name(self) -> str:

@@ -23,7 +23,7 @@ class PlanOptions:
     spread: NonNegative = 1.0  # by which it is multiplied for the last of several plans that are drawn together
     # what guidance by a World weighs what is earned with, in deviations of the logs' returns, and danger, in calibrated
     # margins; 0: not at all. None: 1 and 10 of a method that follows a World (icbf), 0 of others and under guards that
-    # do it themselves; 10 where values are climbed.
+    # decide what is earned; 10 where values are climbed.
     value_guidance: NonNegative | None = None
     barrier_guidance: NonNegative | None = None
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
