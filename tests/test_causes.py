@@ -725,7 +725,10 @@ def test_verdicts_give_their_reasons():
         assert none.word == word and (word == "fit" or none.reasons[0].startswith("no cause of its danger is found"))
     for names, remedy in (
         (("obs0", "obs1"), "name the entries that tell danger, or log them"),
-        (("own.x", "own.y"), "give a formula of danger (hazard), which may be of a form that no rule has, or log what"),
+        (
+            ("own.x", "own.y"),
+            "log what tells danger, or give a formula of danger (hazard) if it is of distances or speeds",
+        ),
     ):
         known = PredictionError(steps_ahead=(1,), error_of_change=(0.1,), by_entry=dict.fromkeys(names, (0.1,)))
         missed = msgspec.structs.replace(good, recall=0.5)

@@ -33,6 +33,7 @@ _WHERE = {
     "fit": "ringfence.training.worlds",
     "fit_run": "ringfence.training.worlds",
     "load_world": "ringfence.world:load",
+    "save_world": "ringfence.world:save",
     "guard": "ringfence.deploy.controller",
     "build_report": "ringfence.report",
     "UserError": "ringfence.errors",

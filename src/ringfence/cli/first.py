@@ -103,7 +103,7 @@ def demonstrate(folder: Path, tier: str = "expert", quick: bool = False) -> Path
     rounds: dict[str, Any] = {"optimizer_steps": 2} if quick else {}
 
     def planned() -> dict[str, dict]:
-        of_plans = protocol | fewer | {"quiet": True}
+        of_plans: dict[str, Any] = protocol | fewer | {"quiet": True}
         alone = evaluate(planner, barrier_guidance=0.0, **of_plans)
         return {"MADIFF": alone, "ICBF": evaluate(planner, anyway=quick, **of_plans)}
 

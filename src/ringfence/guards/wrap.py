@@ -155,7 +155,8 @@ def under_guard(
         return build(policy, world, hazard, guard, barrier, anyway=anyway, **options)
     if not callable(policy):
         raise UserError(
-            f"guard() got a {type(policy).__name__}; give a callable, observations -> actions, or a policy."
+            f"guard() got a {type(policy).__name__}; give a callable, observations -> actions, or a policy; who acts "
+            "by a run is Controller(run, guard=...)."
         )
     function = of_both(policy)
     spec = world.spec

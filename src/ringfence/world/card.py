@@ -14,6 +14,7 @@ from ringfence.problem.features import LESS
 from ringfence.utils.config import build_config
 from ringfence.utils.text import percent, significant
 from ringfence.world.causes import Cause, Edge, Found
+from ringfence.world.quantities import leaves
 from ringfence.world.settings import Settings
 from ringfence.world.stops import AHEAD, Stop
 
@@ -366,7 +367,7 @@ def _of_barrier(card: Card) -> Iterator[str]:
         )
     if scores.avoidable is not None:
         yield _of_horizon(scores.avoidable, scores.ahead_kept, card.look or Look())
-    if not math.isnan(scores.searched):
+    if not math.isnan(scores.searched) and any(_is_of_places(found) for found in card.causes.values()):
         yield (
             "A guard that searches for actions, where drivers want anything, finds some that keep the margin; of the "
             f"steps where these lead, the logs call {percent(scores.searched)} dangerous, by own places and distances "
@@ -405,10 +406,28 @@ def _of_causes(card: Card) -> Iterator[str]:
             )
 
 
+def _is_of_places(found: Found) -> bool:
+    """Whether some cause reads where somebody is."""
+    each = (leaf.name for cause in found.causes for read in cause.reads for leaf in leaves(read))
+    return any(re.fullmatch(r"own\.[xyz]|.*\.d[xyz]", name) for name in each)
+
+
 def _edge(cause: Cause, edge: Edge) -> str:
-    if edge.at is None or cause.is_rule:  # a rule's words say where
+    """Where it is dangerous; a rule's words say so themselves."""
+    if cause.is_rule:
         return ""
-    return f", {'below' if edge.below else 'above'} {edge.at:.3g}"
+    if edge.at is not None:
+        return f", {_range(-math.inf, edge.at) if edge.below else _range(edge.at, math.inf)}"
+    if not edge.bounds:
+        return ""
+    ends = [*([-math.inf] if edge.inside else []), *edge.bounds, math.inf]
+    return f", {' or '.join(_range(low, high) for low, high in zip(ends[::2], ends[1::2]))}"
+
+
+def _range(low: float, high: float) -> str:
+    if math.isinf(low):
+        return f"below {high:.3g}"
+    return f"above {low:.3g}" if math.isinf(high) else f"{low:.3g} to {high:.3g}"
 
 
 def _of_horizon(avoidable: Avoidable, kept: float, look: Look) -> str:

@@ -119,8 +119,8 @@ def _of_three(offset: tuple[Entry, ...]) -> Iterator[Cause]:
 
 
 def beside(cause: Cause, names: Sequence[str], multiplied: bool = False) -> Iterator[Quantity]:
-    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are; and
-    what is `multiplied`: their squares, as of a way to stop, and products."""
+    """What may shift a threshold of the cause: numbers of oneself, and of the same things, e.g. how large they are, and
+    how far from 0 these are; and what is `multiplied`: their squares, as of a way to stop, and products."""
     own, several = _own(names), things_of(names)
     found = _numbers("", [own])
     for kind, each in several.items():
@@ -129,6 +129,7 @@ def beside(cause: Cause, names: Sequence[str], multiplied: bool = False) -> Iter
             found += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
             found += _closing(kind, each, axes, own) if axes else ()
     yield from found
+    yield from (Length((one,)) for one in found if isinstance(one, Entry))
     if multiplied:
         read = {one for each in cause.reads for one in leaves(each)}
         yield from (squared(one) for one in found if one not in read)

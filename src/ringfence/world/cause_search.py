@@ -13,6 +13,7 @@ This is a noisy-or over causes and agents (Pearl 1988), grown greedily: P(safe) 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -32,7 +33,7 @@ from ringfence.world.cause_counts import (
     within,
 )
 from ringfence.world.causes import CELLS, Cause, Cells, Edge, Found, narrowed, only_of, only_where
-from ringfence.world.quantities import Entry, Length, Over, Quantity, leaves
+from ringfence.world.quantities import All, Entry, Length, Over, Quantity, Sum, leaves
 from ringfence.world.rules import rules_of, tilted_of, weighted_of
 
 MOST = 8  # causes
@@ -186,8 +187,10 @@ def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explai
     """The cause with thresholds that depend on other numbers, or a sum over the team with weights, while these tell
     clearly more: boxes as long as both are, limits that fall along a way. Plain numbers do before what is
     multiplied."""
+    own = _numbers_of(best.cause)
     for also in (False, True)[: 1 + multiplied]:
-        more = [one for one in beside(best.cause, names, also) if _varies(steps, one)]
+        more = [one for one in beside(best.cause, names, also) if _varies(steps, one) and _is_another(steps, one)]
+        more = list(dict.fromkeys([*own, *more]))
         best = _shifted(steps, best, more, explained)
     return best
 
@@ -221,6 +224,31 @@ def _varies(steps: Steps, quantity: Quantity) -> bool:
     return bool(Cause((quantity,)).varies(steps.varies).any())
 
 
+def _numbers_of(cause: Cause) -> list[Quantity]:
+    """What the conditions of a rule of several read."""
+    read = cause.reads[0]
+    each = read.parts if isinstance(read, All) else ()
+    return [part for one in each if isinstance(one, Sum) for part in one.parts]
+
+
+def _folded(steps: Steps, cause: Cause) -> Iterator[Cause]:
+    """A cause of two entries by how far some are from 0, of those that lie on both sides."""
+    if cause.width != 2 or not all(isinstance(read, Entry) for read in cause.reads):
+        return
+    far = [Length((read,)) if _is_another(steps, Length((read,))) else read for read in cause.reads]
+    for reads in itertools.product(*[(a, b) for a, b in zip(cause.reads, far)]):
+        if reads != cause.reads:
+            yield Cause(reads, cause.who)
+
+
+def _is_another(steps: Steps, quantity: Quantity) -> bool:
+    """Whether it tells what a number does not that it is made of: how far that is from 0, on both sides."""
+    if not isinstance(quantity, Length) or len(quantity.parts) > 1:
+        return True
+    x = quantity.parts[0].of(steps.x)
+    return bool((x < 0).any() and (x > 0).any())
+
+
 def _is_of_several(steps: Steps, cause: Cause) -> bool:
     """Whether the distance of the k-th nearest tells what that of each does not: that of the nearest does so where it
     is dangerous to be far from all, and that of the farthest where it is to be near all."""
@@ -240,13 +268,22 @@ def _as_rule(steps: Steps, one: Counted, pool: Sequence[Cause], explained: Expla
     """A cause of several numbers as a rule, near *and* fast or in sight, or near soon, where this tells as much: then
     its edges are known as well as those of a distance are. So are others that read the same entries."""
     about = one.cause.entries()
-    alike = [counted(steps, cause, explained) for cause in pool if cause.width > 1 and cause.entries() == about]
+    alike = [cause for cause in pool if cause.width > 1 and cause.entries() == about]
+    alike = [counted(steps, cause, explained) for cause in (*alike, *_folded(steps, one.cause))]
     own = counted(steps, one.cause, explained)
     likely = [other for other in (own, *alike) if other.gain >= (1 - SIMPLER) * own.gain]
     rules = [counted(steps, rule, explained) for other in likely for rule in rules_of(steps, other, explained)]
+    tilted = (new for box in rules for new in tilted_of(steps, box, explained, _numbers_of(box.cause)))
+    rules += [counted(steps, rule, explained) for rule in tilted]
     least = (1 - SIMPLER) * max(one.gain for one in (own, *rules))
     enough = [rule for rule in rules if rule.gain >= least]
-    return min(enough, key=lambda rule: (len(rule.cause.reads[0].parts), -rule.gain), default=own)
+    return min(enough, key=lambda rule: (*_terms(rule.cause), -rule.gain), default=own)
+
+
+def _terms(rule: Cause) -> tuple[int, int]:
+    """How many conditions a rule has, or numbers a line, and how many numbers in all."""
+    parts = rule.reads[0].parts
+    return len(parts), sum(len(part.parts) for part in parts if isinstance(part, Sum))
 
 
 def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:

@@ -38,7 +38,7 @@ from ringfence.world.causes import Cells, Found
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World, blank_world
 
-FORMAT = 21  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
+FORMAT = 22  # of what is fitted, found and told, and of the views of data: what is cached of another is made again
 EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
 ENOUGH = 0.9  # recall of causes, below which networks on all entries are tried, too
 READ = 500_000  # steps, at most, that stops are looked for in

@@ -274,8 +274,8 @@ def _thing_at(words: Sequence[str]) -> str:
 
 
 def _term(words: str, weight: float, k: int) -> str:
-    size = "" if abs(abs(weight) - 1.0) < 1e-6 else f"{abs(weight):.3g} times "
-    sign = "less " if weight < 0 else "and " if k else ""
+    size = "" if f"{abs(weight):.3g}" == "1" else f"{abs(weight):.3g} times "
+    sign = "less " if weight < 0 else "plus " if k else ""
     return f"{' ' if k else ''}{sign}{size}{words}"
 
 

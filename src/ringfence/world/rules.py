@@ -108,13 +108,15 @@ def tilted_of(steps: Steps, one: Counted, explained: Explained, more: Sequence[Q
         likely.remove(terms[-1])
         numbers = whole.of_quantities(terms)
         found, at = whole.refined(numbers, few.likeliest(few.of_quantities(terms), raw=True)[1])
-        old, weights = conditions[k], tuple(float(w) for w in found)
-        new = Sum((*old.parts, *terms), (*old.weights, *weights), float((old.more or 0.0) - at))
+        needed = whole.needed(numbers, found)
+        numbers, found = numbers[:, needed], found[needed]
+        old, weights, tells = conditions[k], tuple(float(w) for w in found), tuple(terms[j] for j in needed)
+        new = Sum((*old.parts, *tells), (*old.weights, *weights), float((old.more or 0.0) - at))
         alone = replace(whole, values=np.zeros_like(whole.values)).best(numbers, found)
         needless = alone[0] <= whole.best(numbers, found)[0] + NEEDLESS * whole.bad.sum()
-        if needless and max(map(how_many, [*terms, *conditions[:k], *conditions[k + 1 :]])) == one.cause.things:
+        if needless and max(map(how_many, [*tells, *conditions[:k], *conditions[k + 1 :]])) == one.cause.things:
             unit = float(whole.values.std() / max((numbers @ found).std(), 1e-9))
-            new = Sum(tuple(terms), tuple(unit * w for w in weights), -unit * alone[1])
+            new = Sum(tells, tuple(unit * w for w in weights), -unit * alone[1])
         parts = _settled(read, one.cause, (*conditions[:k], new, *conditions[k + 1 :]))
         yield _reading(one.cause, parts[0] if len(parts) == 1 else All(parts))
 
@@ -243,6 +245,16 @@ class _Near:
                 best = _middle_of_best(found)
                 weights, at = tried[best], found[best][1]
         return weights, at
+
+    def needed(self, numbers: np.ndarray, weights: np.ndarray) -> list[int]:
+        """Which of numbers (M, K) tell something beside the others."""
+        kept = list(range(len(weights)))
+        most = self.best(numbers, weights)[0] + NEEDLESS * self.bad.sum()
+        for k in sorted(kept, key=lambda k: abs(weights[k]) * numbers[:, k].std()):
+            rest = [other for other in kept if other != k]
+            if rest and self.best(numbers[:, rest], weights[rest])[0] <= most:
+                kept = rest
+        return kept
 
     def best(self, numbers: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
         """(steps that the condition tells wrongly with these weights of numbers, where danger begins)."""

@@ -33,7 +33,7 @@ BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is
 DIMLY = 0.4
 USUALLY = 10
 AHEAD_KEPT = 0.9  # of the safe steps, by V: cars and discs are at 0.94 and more, robots, logged too fast, at 0 to 0.8
-FORMULA = "give a formula of danger (hazard)"
+FORMULA = "give a formula of danger (hazard) if it is of distances or speeds"
 
 
 def decided(card: Card) -> Card:
@@ -138,7 +138,7 @@ def _remedy_of_untold(card: Card) -> str:
     names = () if card.prediction_error is None else card.prediction_error.by_entry
     if not names or any(UNNAMED.match(name) for name in names):
         return "name the entries that tell danger, or log them"
-    return f"{FORMULA}, which may be of a form that no rule has, or log what tells danger"
+    return f"log what tells danger, or {FORMULA}"
 
 
 def _avoided(scores: BarrierScores) -> float:
