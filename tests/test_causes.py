@@ -211,7 +211,7 @@ def test_what_has_room_for_one_is_dangerous_for_two():
     found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 30, names)
     (cause,) = found.causes
     assert len(thresholds(cause)) == 8 and np.allclose(np.abs(thresholds(cause)), 3.0, atol=0.1)
-    assert "own.x and other.dx below" in cause.name
+    assert "own.x plus other.dx below" in cause.name
     assert found.explained > 0.99 and found.false_alarms < 0.01
     np.testing.assert_allclose(cause.of(jnp.asarray(x)), cause.of(x), atol=1e-5)
 
@@ -683,7 +683,7 @@ def test_a_world_that_is_unfit_is_refused_unless_one_insists():
     assert world.card.verdict.word == "unfit" and world.card.causes == {"": Found(searched=True)}, (
         "no cause explains chance"
     )
-    assert any("or log what tells danger" in remedy for remedy in world.card.verdict.remedies), "all are named"
+    assert any("log what tells danger" in remedy for remedy in world.card.verdict.remedies), "all are named"
     still = lambda observations, state: np.zeros((N, 2))  # noqa: E731
     with pytest.raises(UserError, match="'walks' is unfit to guard by: only .*anyway=True"):
         guard(still, world)

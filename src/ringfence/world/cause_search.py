@@ -243,7 +243,7 @@ def _folded(steps: Steps, cause: Cause) -> Iterator[Cause]:
 
 def _is_another(steps: Steps, quantity: Quantity) -> bool:
     """Whether it tells what a number does not that it is made of: how far that is from 0, on both sides."""
-    if not isinstance(quantity, Length) or len(quantity.parts) > 1:
+    if not isinstance(quantity, Length) or len(quantity.parts) != 1:
         return True
     x = quantity.parts[0].of(steps.x)
     return bool((x < 0).any() and (x > 0).any())
@@ -273,17 +273,19 @@ def _as_rule(steps: Steps, one: Counted, pool: Sequence[Cause], explained: Expla
     own = counted(steps, one.cause, explained)
     likely = [other for other in (own, *alike) if other.gain >= (1 - SIMPLER) * own.gain]
     rules = [counted(steps, rule, explained) for other in likely for rule in rules_of(steps, other, explained)]
+    found = _simplest_rule([own, *rules])
+    if found is not own:
+        return found
     tilted = (new for box in rules for new in tilted_of(steps, box, explained, _numbers_of(box.cause)))
-    rules += [counted(steps, rule, explained) for rule in tilted]
-    least = (1 - SIMPLER) * max(one.gain for one in (own, *rules))
+    return _simplest_rule([own, *(counted(steps, rule, explained) for rule in tilted)])
+
+
+def _simplest_rule(found: Sequence[Counted]) -> Counted:
+    """The simplest rule of those that tell about as much as any; the first, which is none, where all tell less."""
+    own, *rules = found
+    least = (1 - SIMPLER) * max(one.gain for one in found)
     enough = [rule for rule in rules if rule.gain >= least]
-    return min(enough, key=lambda rule: (*_terms(rule.cause), -rule.gain), default=own)
-
-
-def _terms(rule: Cause) -> tuple[int, int]:
-    """How many conditions a rule has, or numbers a line, and how many numbers in all."""
-    parts = rule.reads[0].parts
-    return len(parts), sum(len(part.parts) for part in parts if isinstance(part, Sum))
+    return min(enough, key=lambda rule: (len(rule.cause.reads[0].parts), -rule.gain), default=own)
 
 
 def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
