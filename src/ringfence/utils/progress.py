@@ -37,7 +37,7 @@ SILENT = 4.0  # s after which something is said, however long a step takes
 T = TypeVar("T")
 
 _outer: ContextVar[Progress | None] = ContextVar("outer", default=None)
-_part: ContextVar[_Part] = ContextVar("part")
+_part: ContextVar[_Part | None] = ContextVar("part", default=None)
 
 
 @contextmanager
@@ -180,7 +180,8 @@ class Parts(Progress):
             return 0.0 if found is None else self.expected.pop(found)[1]
 
     def within(self, label: str, share: float) -> None:
-        _part.get().told(label, share)
+        if (one := _part.get()) is not None:
+            one.told(label, share)
         self._show()
 
     def _show(self, at_once: bool = False) -> None:

@@ -14,6 +14,7 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
+from ringfence.utils import interrupts
 from ringfence.world.causes import CELLS, Cause, Cells, Edge, narrowed
 from ringfence.world.quantities import Entry, Quantity, from_zero, is_condition
 
@@ -225,6 +226,7 @@ class Explained:
 
 def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
     """The cause, by what others leave unexplained."""
+    interrupts.check()  # a search counts thousands
     cuts = steps.cells(narrowed(cause, ()))[0]
     cell, agents = steps.picked(cause)
     left = explained.left

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ringfence.utils import interrupts
 from ringfence.world.cause_counts import Counted, Explained, Steps, of_the_worst, parted
 from ringfence.world.causes import VISITED, Cause, Cells
 from ringfence.world.quantities import All, Entry, Over, Quantity, Sum, how_many, leaves, squared
@@ -182,6 +183,7 @@ class _Near:
 
     @classmethod
     def of(cls, read: _Read, cause: Cause, conditions: Sequence[Sum], k: int) -> _Near:
+        interrupts.check()
         things = np.nonzero(cause.holds(read.steps.x.shape[1]))[1]
         each = [_of_picked(one, read.steps.x, read.agents, things) for one in conditions]
         others = [other < 0 for i, other in enumerate(each) if i != k]
