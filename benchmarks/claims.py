@@ -840,7 +840,7 @@ def plans_cross() -> tuple[bool, str]:
     low, high = mean_of_runs(plans - clones)
     cost = max(r["cost"] for some in both for r in some)
     words = f"{plans.mean():.2f} for {clones.mean():.2f} [{low:+.2f}, {high:+.2f}], {len(plans)} seeds, cost {cost}"
-    return bool(low > 0 and cost == 0 and len(plans) >= 2), words
+    return bool(low > 0 and cost == 0 and len(plans) >= 3), words
 
 
 @on("results/planner")
