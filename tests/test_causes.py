@@ -287,6 +287,36 @@ def test_thresholds_may_depend_on_other_numbers():
     np.testing.assert_allclose(cause.reads[0].weights[1] / cause.reads[0].weights[0], 50.0, rtol=0.02)
 
 
+def test_a_threshold_may_depend_on_how_far_a_number_is_from_0():
+    """Leaves of a gate that closes from both sides, and a joint that may bend less the faster one goes either way."""
+    rng = np.random.default_rng(0)
+    x, y, opening = (rng.uniform(*ends, (20_000, 1)) for ends in ((-8, 8), (-4, 4), (0, 4)))
+    unsafe = ((np.abs(x) < 1.2) & (np.abs(y) > opening - 0.45)).any(1)
+    seen = np.stack([x, y, opening], -1).astype(np.float32)
+    found, _ = cause_search.find(seen, unsafe, np.arange(20_000) // 40, ["own.x", "own.y", "gate.opening"])
+    assert found.explained > 0.98 and found.false_alarms < 0.01
+    assert any("|own.y|" in one.name for one in found.causes)
+    speed, bend = rng.uniform(-1.6, 1.6, (20_000, 2)), rng.normal(0, 0.4, (20_000, 2))
+    unsafe = (np.abs(bend) > 1 - 0.25 * np.abs(speed)).any(1)
+    seen = np.stack([speed, bend], -1).astype(np.float32)
+    found, _ = cause_search.find(seen, unsafe, np.arange(20_000) // 40, ["own.v", "own.bend"])
+    (cause,) = found.causes
+    assert found.explained > 0.98 and found.false_alarms < 0.01 and cause.is_rule
+    np.testing.assert_allclose(cause.reads[0].weights[1] / cause.reads[0].weights[0], 4.0, atol=0.1)
+
+
+def test_a_threshold_may_depend_on_another_number_of_the_rule():
+    """A cone that widens below or above another, and ends."""
+    offset = np.random.default_rng(0).normal(0, 1, (30_000, 2, 1, 3)) * [1.2, 1.2, 1.5]
+    far, up = np.linalg.norm(offset[..., :2], axis=-1), np.abs(offset[..., 2])
+    unsafe = ((up < 2.0) & (far < 0.2 + 0.3 * up)).any((1, 2))
+    names = ["other0.dx", "other0.dy", "other0.dz"]
+    x = offset.reshape(30_000, 2, -1).astype(np.float32)
+    found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 60, names)
+    (cause,) = found.causes
+    assert found.explained > 0.98 and found.false_alarms < 0.005 and cause.is_rule
+
+
 def test_danger_may_grow_with_a_square_or_a_product():
     """Too fast to stop before a wall, too near to stop, thrown aside in a bend, and too much power."""
     rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ringfence.datasets.registry import TASKS
 from ringfence.errors import UserError, unknown, whole_number
-from ringfence.guards import BARRIERS, GUARDS, GuardOptions
+from ringfence.guards import BARRIERS, GUARDS, GuardOptions, options_of
 from ringfence.loading.oracle import ORACLE
 from ringfence.proposals.options import DEFAULT, PLANNERS, PlanOptions
 from ringfence.training.runs import Run
@@ -116,7 +116,7 @@ class PolicySpec:
     def guard_decides(self) -> bool:
         """Whether its guard decides what plans earn: it climbs values itself, or spends what limits allow by a margin
         that adapts, where guidance keeps it always."""
-        options = {**GUARDS[self.guard], **dict(self.guard_options)}
+        options = options_of(self.guard, self.barrier, **dict(self.guard_options))
         return any(options.get(name, 0) > 0 for name in ("optimizer_steps", "adapt"))
 
     @property

@@ -129,7 +129,7 @@ def beside(cause: Cause, names: Sequence[str], multiplied: bool = False) -> Iter
             found += _numbers(f"{kind}.", [{f: d for f, d in fields.items() if f[1:] not in axes} for fields in each])
             found += _closing(kind, each, axes, own) if axes else ()
     yield from found
-    yield from (Length((one,)) for one in found if isinstance(one, Entry))
+    yield from _sizes(found)
     if multiplied:
         read = {one for each in cause.reads for one in leaves(each)}
         yield from (squared(one) for one in found if one not in read)
@@ -141,7 +141,7 @@ def of_team(names: Sequence[str]) -> Iterator[Cause]:
     own = _own(names)
     numbers = _numbers("", [own])
     entries = [one for one in numbers if isinstance(one, Entry)]
-    numbers += [Length((one,)) for one in entries]
+    numbers += _sizes(entries)
     numbers += [Product(both) for both in itertools.combinations_with_replacement(entries, 2)]
     yield from (Cause((Over(one, "team"),)) for one in numbers)
 
@@ -264,6 +264,11 @@ def _numbers(of: str, each: Fields) -> list[Quantity]:
         entries = tuple(Entry(tuple(fields[field] for fields in each), of + field) for field in group)
         found += [Length(entries)] if len(entries) > 1 else entries
     return found
+
+
+def _sizes(numbers: Sequence[Quantity]) -> list[Length]:
+    """How far from 0 entries are."""
+    return [Length((one,)) for one in numbers if isinstance(one, Entry)]
 
 
 def _groups(names: Sequence[str]) -> Iterator[tuple[str, ...]]:

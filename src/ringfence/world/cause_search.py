@@ -187,10 +187,8 @@ def _tilted(steps: Steps, best: Counted, names: Sequence[str], explained: Explai
     """The cause with thresholds that depend on other numbers, or a sum over the team with weights, while these tell
     clearly more: boxes as long as both are, limits that fall along a way. Plain numbers do before what is
     multiplied."""
-    own = _numbers_of(best.cause)
     for also in (False, True)[: 1 + multiplied]:
         more = [one for one in beside(best.cause, names, also) if _varies(steps, one) and _is_another(steps, one)]
-        more = list(dict.fromkeys([*own, *more]))
         best = _shifted(steps, best, more, explained)
     return best
 
